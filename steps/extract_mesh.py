@@ -30,7 +30,7 @@ from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture
 from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
-from dg4d_lib.mesh.tracking.elastic import relax
+from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
@@ -145,7 +145,7 @@ def _tracked(
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
-        offsets = relax(vertices, registered, faces, silhouettes)
+        offsets = turn_back(vertices, relax(vertices, registered, faces, silhouettes), faces, silhouettes)
         ious = silhouette_iou(vertices + offsets, faces, silhouettes)
         mesh, sources = coloring.result()
     if video is not None:
@@ -170,11 +170,12 @@ def _guided(
         vertices, faces, rest, rasterize, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
+    silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
+    refined = turn_back(vertices, refined, faces, silhouettes)
     moved = vertices + refined
     normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
     texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
     mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
-    silhouettes = render_silhouettes(states, range(len(moved)), rasterize, video.alpha[..., 0])
     tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=frame)
     return tracked, silhouette_iou(moved, faces, silhouettes)
 

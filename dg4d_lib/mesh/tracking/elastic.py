@@ -19,6 +19,7 @@ from torch import Tensor
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.models.flips import unflip
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown, screened_factors
 from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
@@ -79,6 +80,36 @@ def relax(
     return relaxed
 
 
+def turn_back(
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    silhouettes: Bool[Tensor, "t k h w"],
+) -> Float[Tensor, "t v 3"]:
+    """Return offsets with fewer flipped faces, by `unflip`, in frames where silhouettes and other defects allow it.
+
+    Args:
+        vertices: in the reference frame, not split along seams.
+        offsets: of the tracked vertices at every frame.
+        faces: counter-clockwise seen from outside.
+        silhouettes: of the frames (`render_silhouettes`).
+    """
+    body = ElasticBody(vertices.double().numpy(), faces.numpy())
+    turned = offsets.clone()
+
+    def turn_frame(frame: int) -> None:
+        moved = (vertices + offsets[frame]).double().numpy()
+        repaired, _ = unflip(body.rest, moved, body.faces, body.rotations(moved))
+        if repaired is moved or body.defective(repaired).sum() >= body.defective(moved).sum():
+            return
+        outline = silhouettes[frame, None]
+        if _iou(repaired, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
+            turned[frame] = torch.from_numpy(repaired - body.rest).to(offsets)
+
+    run_parallel([partial(turn_frame, frame) for frame in range(len(offsets))])
+    return turned
+
+
 def _iou(moved: Float64[np.ndarray, "v 3"], faces: Int[Tensor, "f 3"], silhouettes: Bool[Tensor, "1 k h w"]) -> float:
     return float(silhouette_iou(torch.from_numpy(moved).float()[None], faces, silhouettes)[0])
 
@@ -97,6 +128,12 @@ class ElasticBody:
     def defective(self, moved: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
         """Mark the faces with defects that the rest shape does not have."""
         return self._finder.defective(moved) & self._sound_at_rest
+
+    def rotations(self, moved: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3 3"]:
+        """Return the rotation of every vertex that turns its edges at rest into the present ones best."""
+        rotations = np.empty((len(moved), 3, 3))
+        _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
+        return rotations
 
     def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
         """Return the relaxed positions of one frame."""
@@ -128,7 +165,7 @@ class ElasticBody:
             free: vertices that may move.
             passes: alternations of rotations and positions.
         """
-        moved, rotations, forces = start.copy(), np.empty((len(start), 3, 3)), np.empty_like(start)
+        moved, forces = start.copy(), np.empty_like(start)
         rows: slice | Int[np.ndarray, " n"] = slice(None)
         if free is None:
             solve = (self._whole if (pull == PULL).all() else screened_factors(self.laplacian, pull)).solve
@@ -137,8 +174,7 @@ class ElasticBody:
             solve = screened_factors(self.laplacian[rows][:, rows], pull[rows]).solve
             outside = self.laplacian[rows][:, ~free]
         for _ in range(passes):
-            _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
-            _forces(self.edges.indptr, self.edges.indices, self.rest, rotations, forces)
+            _forces(self.edges.indptr, self.edges.indices, self.rest, self.rotations(moved), forces)
             wanted = (forces + pull[:, None] * tracked)[rows]
             moved[rows] = solve(wanted if free is None else wanted - outside @ moved[~free])
         return moved

@@ -8,7 +8,7 @@ import trimesh
 from dg4d_lib.mesh.extraction.silhouettes import cameras_of, silhouette_iou
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.folds import DefectFinder, genus, self_intersecting, surface_defects
-from dg4d_lib.mesh.tracking.elastic import relax
+from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 
@@ -166,3 +166,34 @@ def test_a_rigid_motion_is_left_as_it_is() -> None:
     turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]
     offsets = torch.from_numpy(vertices @ turn.T + [0.1, 0.2, 0.3] - vertices)[None]
     torch.testing.assert_close(relax(torch.from_numpy(vertices), offsets, torch.from_numpy(faces)), offsets)
+
+
+def test_flipped_faces_are_turned_back_where_the_outlines_allow_it() -> None:
+    vertices, faces = sphere(3)
+    vertices = 0.4 * vertices  # within the picture
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]
+    corner, neighbor, _ = faces[100]
+    overtaken = vertices.copy()
+    overtaken[corner] += 2 * (vertices[neighbor] - vertices[corner])
+    rest, triangles = torch.from_numpy(vertices).float(), torch.from_numpy(faces)
+    states = torch.from_numpy(np.stack([vertices @ turn.T, overtaken @ turn.T])).float()
+    outlines = torch.stack([rasterize_mesh(states, triangles, views).faces >= 0 for views in cameras_of(2)], 1)
+    turned = rest + turn_back(rest, states - rest, triangles, outlines)
+    torch.testing.assert_close(turned[0], states[0])  # nothing to do
+    before, after = (surface_defects(state.numpy(), faces, vertices) for state in (states[1], turned[1]))
+    assert before.flipped > after.flipped == 0
+    far = np.linalg.norm(vertices - vertices[corner], axis=1) > 0.2
+    torch.testing.assert_close(turned[1, far], states[1, far])
+
+
+def test_flipped_faces_stay_where_outlines_ask_for_them() -> None:
+    vertices, faces = sphere(2)
+    vertices = 0.3 * vertices
+    spiked = vertices.copy()
+    spiked[faces[100]] *= -2.5  # a triangle through the other side
+    rest, spike, triangles = (torch.from_numpy(array) for array in (vertices, spiked, faces))
+    rest, offsets = rest.float(), (spike - rest)[None].float()
+    assert surface_defects(spiked, faces, vertices).flipped > 0
+    for shown, kept in ((rest + offsets, True), (rest[None], False)):
+        outlines = torch.stack([rasterize_mesh(shown, triangles, views).faces >= 0 for views in cameras_of(1)], 1)
+        assert torch.equal(turn_back(rest, offsets, triangles, outlines), offsets) is kept
