@@ -1,8 +1,8 @@
 """Segmentation of a surface into few charts that flatten with little distortion.
 
 Charts are split in two until each is a disk that flattens without overlap and with an even texel density, and are then
-merged again where the union passes the same test. A split groups the faces around two directions of normals, by growth
-over the surface (Sander et al. 2003, section 3).
+merged again where the union passes the same test; if many are left, within wider limits. A split groups the faces
+around two directions of normals, by growth over the surface (Sander et al. 2003, section 3).
 """
 
 import heapq
@@ -20,16 +20,33 @@ from dg4d_lib.mesh.neighbors import edge_keys, half_edges
 from dg4d_lib.mesh.texturing.flatten import flat_areas, flatten, overlapping
 
 DENSITIES = (0.72, 1.35)  # bounds of the linear texel density in a chart, relative to its mean
-OUTSIDE = 0.005  # share of a chart's area that may lie below, and above, these bounds
 LLOYD = 4  # rounds of new seeds and growth per split
 TURN_COST = 1.05  # cost of growth per length along normals at a right angle to the seed's; 0.05 along equal ones
 SMOOTHING = 10  # maximum rounds over all faces that straighten borders
 ROUNDS = 20  # maximum rounds of merges
-LARGEST = 1 / 20  # share of the surface that a chart may have: small charts fill a texture better
-RAGGEDEST = 6.5  # outline of a merged chart over the square root of its area: a circle has 3.5, a strip 1 x 10 7.0
+MANY = 40  # charts above which some are merged within wider limits
+
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a chart may be like.
+
+    Attributes:
+        largest: share of the surface; small charts fill a texture better.
+        raggedest: outline of a merged chart over the square root of its area: a circle has 3.5, a strip 1 x 10 7.0.
+        outside: share of its area that may lie below, and above, the bounds of the texel density.
+    """
+
+    largest: float
+    raggedest: float
+    outside: float
+
+
+NARROW, WIDE = Limits(1 / 20, 6.5, 0.005), Limits(1 / 12, 8.0, 0.02)
 
 
 @dataclass(frozen=True)
@@ -61,19 +78,27 @@ def find_charts(
     """
     surface = _Surface(vertices.astype(np.float64), faces.astype(np.int64), smooth.astype(np.float64))
     labels = surface.connected(np.zeros(len(faces), np.int64))
-    failed = ~surface.passes(labels, np.ones(len(faces), bool))[labels]
+    failed = ~surface.passes(labels, np.ones(len(faces), bool), NARROW)[labels]
     while failed.any():
         labels = surface.connected(surface.split(labels, failed))
-        failed = failed & ~surface.passes(labels, failed)[labels]
-    return surface.flattened(_straightened(surface, _merged(surface, labels)))
+        failed = failed & ~surface.passes(labels, failed, NARROW)[labels]
+    labels = _merged(surface, labels, NARROW, least=1)
+    limits = NARROW
+    if labels.max() >= MANY:
+        limits, labels = WIDE, _merged(surface, labels, WIDE, least=MANY)
+    return surface.flattened(_straightened(surface, labels, limits))
 
 
-def _merged(surface: "_Surface", labels: Labels) -> Labels:
-    """Merge neighbors as long as the union passes the test; the most enclosed charts go first."""
+def _merged(surface: "_Surface", labels: Labels, limits: Limits, least: int) -> Labels:
+    """Merge neighbors as long as the union passes the test, down to some charts; the most enclosed go first."""
     refused: set[tuple[int, int]] = set()
     for _ in range(ROUNDS):
-        pairs, taken = [], set[int]()
-        for first, second in surface.neighbors(labels):
+        pairs: list[tuple[int, int]] = []
+        taken: set[int] = set()
+        excess = len(np.unique(labels)) - least
+        for first, second in surface.neighbors(labels, limits):
+            if len(pairs) == excess:
+                break
             if (first, second) not in refused and not {first, second} & taken:
                 pairs.append((first, second))
                 taken |= {first, second}
@@ -83,7 +108,7 @@ def _merged(surface: "_Surface", labels: Labels) -> Labels:
         for first, second in pairs:
             united[second] = first
         merged = united[labels]
-        passed = surface.passes(merged, np.isin(labels, list(taken)))
+        passed = surface.passes(merged, np.isin(labels, list(taken)), limits)
         fresh = labels.max() + 1
         for first, second in pairs:
             if passed[first]:
@@ -96,7 +121,7 @@ def _merged(surface: "_Surface", labels: Labels) -> Labels:
     return np.asarray(np.unique(labels, return_inverse=True)[1].ravel())
 
 
-def _straightened(surface: "_Surface", labels: Labels) -> Labels:
+def _straightened(surface: "_Surface", labels: Labels, limits: Limits) -> Labels:
     """Straighten the borders between all charts that pass the test afterwards."""
     fixed = np.zeros(labels.max() + 1, bool)
     everywhere = np.ones(len(labels), bool)
@@ -104,7 +129,7 @@ def _straightened(surface: "_Surface", labels: Labels) -> Labels:
         straight = surface.straightened(labels, movable=~fixed[labels])
         parts = surface.connected(straight)
         pieces = np.bincount(straight[np.unique(parts, return_index=True)[1]], minlength=len(fixed))
-        failed = (pieces != 1) | ~surface.passes(straight, everywhere)
+        failed = (pieces != 1) | ~surface.passes(straight, everywhere, limits)
         if not (failed & ~fixed).any():
             return straight
         fixed |= failed
@@ -152,11 +177,11 @@ class _Surface:
         _, first, faces = np.unique(corners, return_index=True, return_inverse=True)
         return self.faces[chosen].ravel()[first], faces.reshape(-1, 3)
 
-    def passes(self, labels: Labels, chosen: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " c"]:
+    def passes(self, labels: Labels, chosen: Bool[np.ndarray, " f"], limits: Limits) -> Bool[np.ndarray, " c"]:
         """Test the charts of chosen faces: disks, without overlap, of even density and compact."""
         count = int(labels.max()) + 1
         single = np.bincount(labels) == 1
-        small = np.bincount(labels, self.areas) <= LARGEST * self.areas.sum()
+        small = np.bincount(labels, self.areas) <= limits.largest * self.areas.sum()
         chosen = chosen & (small | single)[labels]
         if not chosen.any():
             return np.zeros(count, bool)
@@ -180,7 +205,7 @@ class _Surface:
             for beyond in (densities[0] < DENSITIES[0], densities[0] > DENSITIES[1])
         ]
         flipped = np.bincount(names, flat_areas(charts.flat, charts.faces) <= 0, count) > 0
-        even = ~flipped & (shares[0] <= OUTSIDE) & (shares[1] <= OUTSIDE)
+        even = ~flipped & (shares[0] <= limits.outside) & (shares[1] <= limits.outside)
         return passed & (single | (even & ~overlapping(charts.flat, charts.faces, names, count)))
 
     def densities(self, charts: Charts, chosen: Bool[np.ndarray, " f"]) -> tuple[Array, Array]:
@@ -244,7 +269,7 @@ class _Surface:
         _straighten(self.across, movable, self.lengths.reshape(-1, 3), straight)
         return straight
 
-    def neighbors(self, labels: Labels) -> list[tuple[int, int]]:
+    def neighbors(self, labels: Labels, limits: Limits) -> list[tuple[int, int]]:
         """Return pairs of charts that share a border, the most enclosed first, without large and ragged unions."""
         count = int(labels.max()) + 1
         sides = np.sort(labels[self.pairs // 3], 1)
@@ -256,8 +281,10 @@ class _Surface:
         inner = ~border
         outlines -= np.bincount(sides[inner, 0], 2 * self.lengths[self.pairs[inner, 0]], count)
         areas = np.bincount(labels, self.areas, count)
-        left_out = areas[first] + areas[second] > LARGEST * areas.sum()
-        left_out |= outlines[first] + outlines[second] - 2 * shared > RAGGEDEST * np.sqrt(areas[first] + areas[second])
+        left_out = areas[first] + areas[second] > limits.largest * areas.sum()
+        left_out |= outlines[first] + outlines[second] - 2 * shared > limits.raggedest * np.sqrt(
+            areas[first] + areas[second]
+        )
         enclosed = shared / np.maximum(np.minimum(outlines[first], outlines[second]), 1e-30)
         order = np.argsort(-enclosed, kind="stable")
         return [(int(first[i]), int(second[i])) for i in order if not left_out[i]]

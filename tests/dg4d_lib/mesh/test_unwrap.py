@@ -96,6 +96,20 @@ def test_charts_are_shown_as_seen_from_outside(flat: tuple[np.ndarray, ...]) -> 
     assert (np.linalg.det(sides.astype(np.float64)) < 0).all()
 
 
+@pytest.mark.parametrize("fewer", [1, 3])
+def test_above_the_limit_charts_are_merged_down_to_it(
+    torus: Mesh, flat: tuple[np.ndarray, ...], monkeypatch: pytest.MonkeyPatch, fewer: int
+) -> None:
+    count = charts(flat[1]).max() + 1
+    monkeypatch.setattr("dg4d_lib.mesh.texturing.charts.MANY", count)
+    assert np.array_equal(unwrap(*torus, SIZE)[2], flat[2])
+    monkeypatch.setattr("dg4d_lib.mesh.texturing.charts.MANY", count - fewer)
+    sources, faces, uvs = unwrap(*torus, SIZE)
+    assert charts(faces).max() + 1 == count - fewer
+    np.testing.assert_array_equal(torus[0][sources][faces], torus[0][torus[1]])
+    assert (drawn(faces, uvs)[0] <= 1).all()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_the_texel_density_is_even(noise: float) -> None:
     mesh = trimesh.creation.icosphere(4)
