@@ -34,6 +34,28 @@ STEP = 15  # pixel sides, at the depth of a pixel: a neighbor that is nearer by 
 Texture = Float[Tensor, "h w 3"]
 
 
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels of frames, and the samples of the texture that they average.
+
+    Attributes:
+        lookup: of all samples.
+        pixels: of every sample, the index of its pixel; the number of pixels for samples of none.
+        colors: of the pixels in the footage.
+        weights: of their squared errors.
+    """
+
+    lookup: TextureLookup
+    pixels: Int64[Tensor, " n"]
+    colors: Float[Tensor, "p 3"]
+    weights: Float[Tensor, "p 1"]
+
+    def render(self, texture: Texture) -> Float[Tensor, "p 3"]:
+        """Return the colors of the pixels with a texture; linear in it."""
+        sums = texture.new_zeros((len(self.colors) + 1, 3))
+        return sums.index_add(0, self.pixels, sample_texture(texture, self.lookup))[:-1] / SUPERSAMPLING**2
+
+
 def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
     """Return the texture whose renders are closest to footage, near the given one where no frame shows more.
 
@@ -54,9 +76,8 @@ def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
     return level_seams(texture.clamp(0, 1), points)
 
 
-def _best_change(start: Texture, frames: "_Pixels") -> Texture:
+def _best_change(start: Texture, frames: _Pixels) -> Texture:
     """Return what to add to a texture."""
-
     variable = start.clone().requires_grad_()
     seen = frames.render(variable)
 
@@ -79,28 +100,6 @@ def _best_change(start: Texture, frames: "_Pixels") -> Texture:
 
 def _flat(texture: Texture) -> NDArray[np.float64]:
     return texture.double().numpy().ravel()
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """Pixels of frames, and the samples of the texture that they average.
-
-    Attributes:
-        lookup: of all samples.
-        pixels: of every sample, the index of its pixel; the number of pixels for samples of none.
-        colors: of the pixels in the footage.
-        weights: of their squared errors.
-    """
-
-    lookup: TextureLookup
-    pixels: Int64[Tensor, " n"]
-    colors: Float[Tensor, "p 3"]
-    weights: Float[Tensor, "p 1"]
-
-    def render(self, texture: Texture) -> Float[Tensor, "p 3"]:
-        """Return the colors of the pixels with a texture; linear in it."""
-        sums = texture.new_zeros((len(self.colors) + 1, 3))
-        return sums.index_add(0, self.pixels, sample_texture(texture, self.lookup))[:-1] / SUPERSAMPLING**2
 
 
 def _seen_pixels(mesh: TexturedMesh, surface: PosedSurface) -> _Pixels | None:
