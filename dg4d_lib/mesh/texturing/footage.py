@@ -93,7 +93,7 @@ def _best_change(start: Texture, frames: _Pixels) -> Texture:
         return _flat(spread(rendered) + KEPT * change + EVEN * _differences(change))
 
     diagonal = _flat(spread(torch.ones_like(seen)) + KEPT + 4 * EVEN)
-    matrix, scale = LinearOperator(2 * diagonal.shape, normal), diags_array(1 / diagonal)
+    matrix, scale = LinearOperator(2 * diagonal.shape, normal, dtype=np.float64), diags_array(1 / diagonal)
     change, _ = cg(matrix, _flat(spread(frames.colors - seen.detach())), rtol=0, maxiter=ITERATIONS, M=scale)
     return torch.from_numpy(change.reshape(start.shape)).to(start)
 

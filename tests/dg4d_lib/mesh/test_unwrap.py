@@ -100,7 +100,7 @@ def test_charts_are_shown_as_seen_from_outside(flat: tuple[np.ndarray, ...]) -> 
 def test_above_the_limit_charts_are_merged_down_to_it(
     torus: Mesh, flat: tuple[np.ndarray, ...], monkeypatch: pytest.MonkeyPatch, fewer: int
 ) -> None:
-    count = charts(flat[1]).max() + 1
+    count = int(charts(flat[1]).max()) + 1
     monkeypatch.setattr("dg4d_lib.mesh.texturing.charts.MANY", count)
     assert np.array_equal(unwrap(*torus, SIZE)[2], flat[2])
     monkeypatch.setattr("dg4d_lib.mesh.texturing.charts.MANY", count - fewer)
