@@ -3,12 +3,15 @@
 import torch
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.asset_motion import Report, iterations
 from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.metrics.image import iou
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
@@ -20,6 +23,7 @@ FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
+LOST = 0.85  # overlap of silhouettes with the video, IoU, below which flow has a try at hulls of few views, too
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -49,9 +53,24 @@ def surface_tracker(
     report: Report = lambda iteration, values: None,
 ) -> Track:
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`."""
-    settings = tracking_of(known)
+
+    def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> MovedSurfaces:
+        return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
 
     def track(surface: InflatedSurface) -> MovedSurfaces:
-        return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, report))
+        settings = tracking_of(known)
+        moved = follow(surface, settings, report)
+        if settings is SOFT and _overlap(moved, video) < LOST:
+            done = iterations(settings, len(video))
+            other = follow(surface, FLOW, lambda _, values: report(done, values))
+            return max(moved, other, key=lambda one: _overlap(one, video))
+        return moved
 
     return track
+
+
+def _overlap(moved: MovedSurfaces, video: DrivingVideo) -> float:
+    """Return the intersection over union of silhouettes at the input view, mean over frames."""
+    camera = OrbitCamera(width=video.alpha.shape[2], height=video.alpha.shape[1])
+    _, alpha = moved.clean([GuidanceView(camera, frame) for frame in range(len(video))])
+    return float(iou(alpha, video.alpha.to(alpha)).mean())
