@@ -54,7 +54,7 @@ def angle_deg(one: OrbitCamera, other: OrbitCamera) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 
 
-def shows_sides(views: Sequence[KnownView], least_deg: float) -> bool:
-    """Return True if two views differ by this angle or more, counting opposite directions as equal."""
-    pairs = [(a, b) for i, a in enumerate(views) for b in views[:i]]
-    return any(least_deg <= angle_deg(a.camera, b.camera) <= 180 - least_deg for a, b in pairs)
+def shows_sides(cameras: Sequence[OrbitCamera], least_deg: float) -> bool:
+    """Return True if two cameras differ by this angle or more, counting opposite directions as equal."""
+    pairs = [(one, other) for number, one in enumerate(cameras) for other in cameras[:number]]
+    return any(least_deg <= angle_deg(one, other) <= 180 - least_deg for one, other in pairs)

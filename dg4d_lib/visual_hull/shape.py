@@ -24,7 +24,7 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
     """
     carving = _carving(views)
     volume = hull(carving, CELLS)
-    if not shows_sides(carving, SIDE_DEG):
+    if not _shows_sides(carving):
         return bounded(volume, carving, fitting_turn(carving))
     return probable(volume, views, predict) if predict is not None and leaves_doubt(views) else volume
 
@@ -32,8 +32,12 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
 def leaves_doubt(views: Sequence[KnownView]) -> bool:
     """Return True if views bound the hull on all sides, but are few: a prediction then counts."""
     carving = _carving(views)
-    return shows_sides(carving, SIDE_DEG) and len(carving) <= ALL_AROUND
+    return _shows_sides(carving) and len(carving) <= ALL_AROUND
 
 
 def _carving(views: Sequence[KnownView]) -> list[KnownView]:
     return [view for view in views if view.weight >= CARVES]
+
+
+def _shows_sides(views: Sequence[KnownView]) -> bool:
+    return shows_sides([view.camera for view in views], SIDE_DEG)

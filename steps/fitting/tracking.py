@@ -15,7 +15,8 @@ from dg4d_lib.metrics.image import iou
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.visual_hull.shape import ALL_AROUND
+from dg4d_lib.visual_hull.known import shows_sides
+from dg4d_lib.visual_hull.shape import ALL_AROUND, SIDE_DEG
 from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
@@ -23,7 +24,7 @@ FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
-LOST = 0.85  # overlap of silhouettes with the video, IoU, below which flow has a try at hulls of few views, too
+LOST = 0.85  # overlap of silhouettes with the video, IoU, below which flow has a try at hulls with sides, too
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -58,9 +59,9 @@ def surface_tracker(
         return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
 
     def track(surface: InflatedSurface) -> MovedSurfaces:
-        settings = tracking_of(known)
+        settings, sides = tracking_of(known), shows_sides([OrbitCamera(), *known.cameras], SIDE_DEG)
         moved = follow(surface, settings, report)
-        if settings is SOFT and _overlap(moved, video) < LOST:
+        if settings is SOFT and sides and _overlap(moved, video) < LOST:
             done = iterations(settings, len(video))
             other = follow(surface, FLOW, lambda _, values: report(done, values))
             return max(moved, other, key=lambda one: _overlap(one, video))
