@@ -11,6 +11,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 
 CARVES = 0.5  # weight from which the outline of a view bounds the hull
+SIDE_DEG = 50.0  # between views: less leaves the depth open, and the inflation bounds it
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def angle_deg(one: OrbitCamera, other: OrbitCamera) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 
 
-def shows_sides(cameras: Sequence[OrbitCamera], least_deg: float) -> bool:
-    """Return True if two cameras differ by this angle or more, counting opposite directions as equal."""
+def shows_sides(cameras: Sequence[OrbitCamera]) -> bool:
+    """Return True if two cameras differ by `SIDE_DEG` or more, counting opposite directions as equal."""
     pairs = [(one, other) for number, one in enumerate(cameras) for other in cameras[:number]]
-    return any(least_deg <= angle_deg(one, other) <= 180 - least_deg for one, other in pairs)
+    return any(SIDE_DEG <= angle_deg(one, other) <= 180 - SIDE_DEG for one, other in pairs)

@@ -9,7 +9,6 @@ from dg4d_lib.visual_hull.probable import Predict, probable
 
 CELLS = 128  # along the longest side of the subject
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
-SIDE_DEG = 50.0  # between views: less leaves the depth open, and the inflation bounds it
 
 
 def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> Volume:
@@ -24,7 +23,7 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
     """
     carving = _carving(views)
     volume = hull(carving, CELLS)
-    if not _shows_sides(carving):
+    if not shows_sides([view.camera for view in carving]):
         return bounded(volume, carving, fitting_turn(carving))
     return probable(volume, views, predict) if predict is not None and leaves_doubt(views) else volume
 
@@ -32,12 +31,8 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
 def leaves_doubt(views: Sequence[KnownView]) -> bool:
     """Return True if views bound the hull on all sides, but are few: a prediction then counts."""
     carving = _carving(views)
-    return _shows_sides(carving) and len(carving) <= ALL_AROUND
+    return shows_sides([view.camera for view in carving]) and len(carving) <= ALL_AROUND
 
 
 def _carving(views: Sequence[KnownView]) -> list[KnownView]:
     return [view for view in views if view.weight >= CARVES]
-
-
-def _shows_sides(views: Sequence[KnownView]) -> bool:
-    return shows_sides([view.camera for view in views], SIDE_DEG)

@@ -16,7 +16,7 @@ class MeshPlan(Frozen):
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
     followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 if none")
     level: float = Field(description="density of the surface")
-    grid: int | None = Field(None, description="resolution of the density field; none: that of the settings")
+    grid: int | None = Field(None, ge=16, le=512, description="cells of the density field per axis; none: `mesh.grid`")
     guide: Literal["gaussians", "video"] = Field("gaussians", description="what the vertices of a tracked mesh follow")
 
 

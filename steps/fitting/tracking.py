@@ -16,7 +16,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.known import shows_sides
-from dg4d_lib.visual_hull.shape import ALL_AROUND, SIDE_DEG
+from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
@@ -59,13 +59,16 @@ def surface_tracker(
         return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
 
     def track(surface: InflatedSurface) -> MovedSurfaces:
-        settings, sides = tracking_of(known), shows_sides([OrbitCamera(), *known.cameras], SIDE_DEG)
+        settings = tracking_of(known)
         moved = follow(surface, settings, report)
-        if settings is SOFT and sides and _overlap(moved, video) < LOST:
-            done = iterations(settings, len(video))
-            other = follow(surface, FLOW, lambda _, values: report(done, values))
-            return max(moved, other, key=lambda one: _overlap(one, video))
-        return moved
+        if settings is not SOFT or not shows_sides([OrbitCamera(), *known.cameras]):
+            return moved
+        overlap = _overlap(moved, video)
+        if overlap >= LOST:
+            return moved
+        done = iterations(settings, len(video))
+        other = follow(surface, FLOW, lambda _, values: report(done, values))
+        return other if _overlap(other, video) > overlap else moved
 
     return track
 

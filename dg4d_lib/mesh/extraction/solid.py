@@ -1,6 +1,6 @@
-"""Bodies of a density field without inner walls and without doubtful contacts.
+"""Cavities of a density field, and cells whose isosurface is ambiguous.
 
-A body is the set of samples at or above a level.
+Solid are the samples at or above a level, the others are empty.
 """
 
 import itertools
@@ -14,7 +14,7 @@ from dg4d_lib.mesh.shifts import Slices, shifted
 LEAK = 2  # cells; a cavity that opens to the outside only through gaps narrower than twice this is filled
 
 Step = tuple[int, ...]
-# To the opposite corner of a face or a cube of samples, one of the two directions of each
+# Steps to diagonal neighbors on a face and through a cell, one of each two opposite ones
 DIAGONALS: tuple[Step, ...] = tuple(
     step for step in itertools.product((-1, 0, 1), repeat=3) if sum(map(abs, step)) > 1 and step > (0, 0, 0)
 )
@@ -30,12 +30,13 @@ def cavities(solid: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
     return inside[border, border, border]
 
 
-def doubtful(values: Float[np.ndarray, "i j k"], level: float) -> Bool[np.ndarray, "i j k"]:
-    """Mark the densest empty samples between solid ones, or solid ones between empty ones, that touch at a corner only.
+def ambiguous(values: Float[np.ndarray, "i j k"], level: float) -> Bool[np.ndarray, "i j k"]:
+    """Mark empty samples that must be filled so that no cell of marching cubes is ambiguous.
 
-    There the interpolation decides whether an isosurface joins or parts them, and noise makes handles. A body without
-    such places has the topology of its samples ("well-composed sets", Latecki 1997). Filling the marked samples can
-    make new ones.
+    A cell is ambiguous where two solid samples, or two empty ones, are diagonal neighbors and nothing of their kind
+    lies between them: the interpolation joins or parts them, and noise makes handles. Without such cells, the
+    isosurface has the topology of the samples ("well-composed sets", Latecki 1997). Of the samples that would do, the
+    densest is marked. Filling them can make other cells ambiguous.
     """
     solid, marked = values >= level, np.zeros(values.shape, bool)
     for step in DIAGONALS:

@@ -22,7 +22,7 @@ from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
-from dg4d_lib.mesh.extraction.solid import cavities, doubtful
+from dg4d_lib.mesh.extraction.solid import ambiguous, cavities
 from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -39,7 +39,7 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
     """Return the field with narrow tunnels filled, except those that some view looks through.
 
     A morphological closing (dilation by a ball, then erosion) gives the candidates; those that lower the genus are
-    filled. So are cavities, as these hide tunnels, and `doubtful` samples, as the interpolation makes handles of them.
+    filled. So are cavities, which hide tunnels, and `ambiguous` samples, of which the interpolation makes handles.
 
     Args:
         field: the density of these Gaussians.
@@ -56,7 +56,7 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
     fillings = (
         lambda: _hidden_tunnels(padded >= level, origin, field.cell, views),
         lambda: cavities(padded >= level),
-        lambda: doubtful(padded, level),
+        lambda: ambiguous(padded, level),
     )
     changed = True
     while changed:

@@ -125,7 +125,7 @@ def bake_texture(
         camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
         moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
         reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
-        pictures = graded(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
+        pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
         rule = flattest, INPUT_WEIGHT * posed.weight
         run_parallel([partial(_add, moved, [camera], pictures, [rule], part, total) for part in parts])
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
@@ -219,10 +219,10 @@ def _render_views(
     with torch.no_grad():
         render = rasterize(gaussians, cameras, torch.zeros(3))
     color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
-    return graded(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
+    return grade_pixels(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
 
 
-def graded(
+def grade_pixels(
     color: Float[Tensor, "b h w 3"],
     alpha: Float[Tensor, "b h w"],
     cameras: Sequence[OrbitCamera],
@@ -230,7 +230,20 @@ def graded(
     faces: Int[Tensor, "f 3"],
     reach: int,
 ) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Return pictures with grade and depth, as `_render_views` does; `reach` is the width of the unreliable band."""
+    """Tell which pixels of pictures lie inside the subject, and how deep the mesh is there.
+
+    Args:
+        color: straight, in [0, 1].
+        alpha: in [0, 1].
+        cameras: of the pictures.
+        vertices: of the mesh, world units.
+        faces: indices into the vertices.
+        reach: width of the unreliable band along silhouettes and occluding edges, pixels.
+
+    Returns:
+        The color; grade (0: background, 1: along the silhouette, `INSIDE`); camera z of the mesh, infinite where there
+        is none; and the minimum of z within `reach` pixels.
+    """
     depth = rasterize_mesh(vertices, faces, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
     inside = _min_filter(alpha, reach) > ALPHA_THRESHOLD

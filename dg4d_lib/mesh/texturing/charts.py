@@ -26,14 +26,13 @@ SMOOTHING = 10  # maximum rounds over all faces that straighten borders
 ROUNDS = 20  # maximum rounds of merges
 MANY = 40  # charts above which some are merged within wider limits
 
-
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a chart may be like.
+    """Limits of the area, the outline and the texel density of a chart.
 
     Attributes:
         largest: share of the surface; small charts fill a texture better.
@@ -282,9 +281,8 @@ class _Surface:
         outlines -= np.bincount(sides[inner, 0], 2 * self.lengths[self.pairs[inner, 0]], count)
         areas = np.bincount(labels, self.areas, count)
         left_out = areas[first] + areas[second] > limits.largest * areas.sum()
-        left_out |= outlines[first] + outlines[second] - 2 * shared > limits.raggedest * np.sqrt(
-            areas[first] + areas[second]
-        )
+        longest = limits.raggedest * np.sqrt(areas[first] + areas[second])
+        left_out |= outlines[first] + outlines[second] - 2 * shared > longest
         enclosed = shared / np.maximum(np.minimum(outlines[first], outlines[second]), 1e-30)
         order = np.argsort(-enclosed, kind="stable")
         return [(int(first[i]), int(second[i])) for i in order if not left_out[i]]

@@ -20,7 +20,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import torch_on_one_thread
 from dg4d_lib.mesh.render import SUPERSAMPLING
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import INSIDE, PosedSurface, graded
+from dg4d_lib.mesh.texturing.bake import INSIDE, PosedSurface, grade_pixels
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.texture import Taps, TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
@@ -28,7 +28,7 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 ITERATIONS = 4  # of conjugate gradients
 KEPT = 0.1  # weight of a texel's squared change; that of a pixel's squared error is 1
 EVEN = 0.1  # weight of the squared difference between the changes of neighboring texels
-DOUBTFUL = 0.3  # weight of a pixel beside an outline or behind an occluding edge
+UNRELIABLE = 0.3  # weight of a pixel beside an outline or behind an occluding edge
 STEP = 15  # pixel sides, at the depth of a pixel: a neighbor that is nearer by more occludes
 
 Texture = Float[Tensor, "h w 3"]
@@ -122,9 +122,9 @@ def _seen_pixels(mesh: TexturedMesh, surface: PosedSurface) -> _Pixels | None:
 def _trust(mesh: TexturedMesh, surface: PosedSurface, camera: OrbitCamera) -> Float[Tensor, "h w"]:
     """Return the weight of every pixel: less beside outlines and occluding edges, 0 outside of the subject."""
     color, alpha = surface.color[None], surface.alpha[None, ..., 0]
-    _, grade, depth, front = graded(color, alpha, [camera], surface.vertices, mesh.faces, 1)
-    doubted: Bool[Tensor, "h w"] = (grade < INSIDE) | (depth - front > STEP * depth / camera.focal)
-    return (torch.where(doubted, DOUBTFUL, 1.0) * (grade > 0))[0]
+    _, grade, depth, front = grade_pixels(color, alpha, [camera], surface.vertices, mesh.faces, 1)
+    unreliable: Bool[Tensor, "h w"] = (grade < INSIDE) | (depth - front > STEP * depth / camera.focal)
+    return (torch.where(unreliable, UNRELIABLE, 1.0) * (grade > 0))[0]
 
 
 def _joined(parts: Sequence[_Pixels]) -> _Pixels:

@@ -7,13 +7,14 @@ Where limbs cross, it must give way far around them, which may move outlines; th
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from numba import njit
+from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
 from dg4d_lib.kernels.workers import run_parallel
@@ -121,9 +122,13 @@ class ElasticBody:
         self.rest, self.faces = rest, faces
         self.edges = edge_graph(faces, len(rest))
         self.laplacian = graph_laplacian(self.edges)
-        self._whole = screened_factors(self.laplacian, np.full(len(rest), PULL))
         self._finder = DefectFinder(faces, rest)
         self._sound_at_rest = ~DefectFinder(faces).defective(rest)
+
+    @cached_property
+    def _whole(self) -> SuperLU:
+        """Factors for vertices that are all free and pulled alike; only `relaxed` needs them."""
+        return screened_factors(self.laplacian, np.full(len(self.rest), PULL))
 
     def defective(self, moved: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
         """Mark the faces with defects that the rest shape does not have."""

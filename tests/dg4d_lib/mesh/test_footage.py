@@ -46,7 +46,7 @@ def turned(mesh: TexturedMesh, angle: float) -> torch.Tensor:
 
 
 def frame_of(mesh: TexturedMesh, angle: float = 0.0, weight: float = 1.0) -> PosedSurface:
-    """What the input camera shows of a turned mesh."""
+    """Render a turned mesh from the input camera."""
     vertices = turned(mesh, angle)
     color, alpha = render_mesh(replace(mesh, vertices=vertices), [CAMERA])
     return PosedSurface(vertices, vertex_normals(vertices, mesh.faces), color[0], alpha[0], weight)

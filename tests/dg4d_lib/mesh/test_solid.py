@@ -3,7 +3,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, generate_binary_structure, label
 from skimage.measure import euler_number, marching_cubes
 
-from dg4d_lib.mesh.extraction.solid import cavities, doubtful
+from dg4d_lib.mesh.extraction.solid import ambiguous, cavities
 from dg4d_lib.mesh.folds import genus
 
 LEVEL = 0.5
@@ -15,9 +15,9 @@ def noise(seed: int, softness: float) -> np.ndarray:
     return np.pad((soft * LEVEL / np.quantile(soft, 0.6)).astype(np.float32), 2)
 
 
-def without_doubt(values: np.ndarray) -> np.ndarray:
+def unambiguous(values: np.ndarray) -> np.ndarray:
     values = values.copy()
-    while (marked := doubtful(values, LEVEL)).any():
+    while (marked := ambiguous(values, LEVEL)).any():
         assert (values[marked] < LEVEL).all()
         values[marked] = 2 * LEVEL
     return values
@@ -28,9 +28,9 @@ def parts(solid: np.ndarray, reach: int) -> int:
 
 
 @pytest.mark.parametrize(("seed", "softness"), [(1, 0.0), (2, 0.5), (3, 0.8), (4, 1.2)])
-def test_samples_without_doubt_have_one_topology_however_neighbors_are_defined(seed: int, softness: float) -> None:
+def test_unambiguous_samples_have_one_topology_however_neighbors_are_defined(seed: int, softness: float) -> None:
     before = noise(seed, softness)
-    after = without_doubt(before) >= LEVEL
+    after = unambiguous(before) >= LEVEL
     assert not (before >= LEVEL)[~after].any()
     assert parts(before >= LEVEL, 1) > parts(before >= LEVEL, 3)
     assert parts(after, 1) == parts(after, 3)
@@ -39,7 +39,7 @@ def test_samples_without_doubt_have_one_topology_however_neighbors_are_defined(s
 
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_surfaces_have_the_handles_of_their_samples(seed: int) -> None:
-    values = without_doubt(noise(seed, 0.9))
+    values = unambiguous(noise(seed, 0.9))
     solid = values >= LEVEL
     rooms = parts(~solid, 1) - 1
     tunnels = parts(solid, 3) + rooms - euler_number(solid, 3)
@@ -54,15 +54,15 @@ def test_the_denser_sample_beside_a_diagonal_contact_is_marked(step: tuple[int, 
     axis = max(number for number, reach in enumerate(step) if reach)
     denser = tuple(2 + reach * (number == axis) for number, reach in enumerate(step))
     values[denser] = 0.3
-    np.testing.assert_array_equal(np.argwhere(doubtful(values, LEVEL)), [denser])
+    np.testing.assert_array_equal(np.argwhere(ambiguous(values, LEVEL)), [denser])
     values[denser] = 0.6
-    assert not doubtful(values, LEVEL)[denser]
+    assert not ambiguous(values, LEVEL)[denser]
 
 
 def test_empty_samples_that_touch_at_a_corner_are_joined_by_none() -> None:
     values = np.ones((6, 6, 6), np.float32)
     values[2, 2, 2], values[3, 3, 3] = 0.2, 0.4
-    np.testing.assert_array_equal(np.argwhere(doubtful(values, LEVEL)), [(3, 3, 3)])
+    np.testing.assert_array_equal(np.argwhere(ambiguous(values, LEVEL)), [(3, 3, 3)])
 
 
 def test_a_room_behind_a_narrow_gap_is_a_cavity_and_an_open_one_is_not() -> None:
