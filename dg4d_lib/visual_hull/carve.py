@@ -67,13 +67,21 @@ class _Silhouette:
         return torch.where(inside, distance * depth / camera.focal, OUTSIDE), place
 
 
-def hull(views: Sequence[KnownView], cells: int, exponent: float = ROUND_EXPONENT) -> Volume:
+def hull(
+    views: Sequence[KnownView],
+    cells: int,
+    exponent: float = ROUND_EXPONENT,
+    reach: float = 0.0,
+    lenience: float = 0.0,
+) -> Volume:
     """Carve the hull of views out of space.
 
     Args:
         views: of one moment, at least one.
         cells: along the longest side of the subject.
         exponent: of the superellipse that two orthogonal views get; more views get a larger one, so that corners stay.
+        reach: distance outside of the hull to which the field is exact, world units; at least `TRUNCATION` cells.
+        lenience: cells by which the silhouettes of all views but the first are wider.
 
     Raises:
         BadInput: a picture shows no subject, or no place is inside of all silhouettes.
@@ -82,10 +90,12 @@ def hull(views: Sequence[KnownView], cells: int, exponent: float = ROUND_EXPONEN
     power = exponent * max(1.0, _directions(views) / 2)
     low, high = _bounds(silhouettes)
     step = float((high - low).max()) / cells
-    low, high = low - 2 * step, high + 2 * step
+    low, high = low - reach - 2 * step, high + reach + 2 * step
     axes = [torch.arange(float(a), float(b) + step, step) for a, b in zip(low, high, strict=True)]
     points = torch.cartesian_prod(*axes)
-    field = torch.cat([_margins(silhouettes, part, step, power) for part in points.split(CHUNK)])
+    lowest = -max(reach, TRUNCATION * step)
+    wider = [lenience * step * (number > 0) for number in range(len(silhouettes))]
+    field = torch.cat([_margins(silhouettes, part, step, power, lowest, wider) for part in points.split(CHUNK)])
     values = field.reshape([len(axis) for axis in axes]).numpy()
     if not (values > 0).any():
         raise BadInput(_apart(views))
@@ -151,20 +161,26 @@ def _bounds(silhouettes: Sequence[_Silhouette]) -> tuple[Float[Tensor, " 3"], Fl
 
 
 def _margins(
-    silhouettes: Sequence[_Silhouette], points: Float[Tensor, "n 3"], step: float, power: float
-) -> Float[Tensor, " n"]:
+    silhouettes: Sequence[_Silhouette], points: Float[Tensor, "n 3"], step: float, power: float, lowest: float,
+    wider: Sequence[float],
+) -> Float[Tensor, " n"]:  # fmt: skip
     """Return the truncated field of points; each view sees those that the earlier ones left."""
     limit = TRUNCATION * step
     field = points.new_full((len(points),), limit)
     places = points.new_zeros(len(points))
     left = torch.arange(len(points))
-    for silhouette in silhouettes:
+    for silhouette, slack in zip(silhouettes, wider, strict=True):
         margin, place = silhouette.sample(points[left])
-        field[left] = torch.minimum(field[left], margin)
+        field[left] = torch.minimum(field[left], margin + slack)
         places[left] += silhouette.weight * place**power
-        left = left[field[left] > -limit]
+        left = left[field[left] > lowest]
     rounded = (1 - places.clamp(min=1e-6) ** (1 / power)) * limit * 4
-    return torch.minimum(field, rounded).clamp(-limit, limit)
+    return torch.minimum(field, rounded).clamp(lowest, limit)
+
+
+def margins_inside(view: KnownView, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Return the margins of points inside of the silhouette of a view, world units."""
+    return _silhouettes([view])[0].sample(points)[0]
 
 
 def margins_of(views: Sequence[KnownView], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -112,4 +112,5 @@ def _inside(
     center, half = grid_sample(planes, at, align_corners=False, padding_mode="border")[0, :, 0]
     limit = TRUNCATION * volume.step
     margin = (half.clamp(min=volume.step) - (z.flatten() - center).abs()).reshape(volume.values.shape).numpy()
-    return replace(volume, values=np.minimum(volume.values, margin).clip(-limit, limit).astype(np.float32))
+    lowest = min(-limit, float(volume.values.min()))
+    return replace(volume, values=np.minimum(volume.values, margin).clip(lowest, limit).astype(np.float32))

@@ -4,15 +4,19 @@ from collections.abc import Sequence
 
 from dg4d_lib.visual_hull.carve import Volume, hull
 from dg4d_lib.visual_hull.columns import bounded, fitting_turn
+from dg4d_lib.visual_hull.cover import REACH, covering
 from dg4d_lib.visual_hull.known import CARVES, KnownView, shows_sides
 from dg4d_lib.visual_hull.probable import Predict, probable
 
 CELLS = 128  # along the longest side of the subject
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
+LENIENCE = 0.5  # cells by which their silhouettes are wider: angles of turntables and of drawn views are a little wrong
 
 
 def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> Volume:
-    """Return the hull of a subject, or its probable part where views are few.
+    """Return the hull of a subject, its probable part where views are few, its columns where none shows a side.
+
+    Hulls of many views, whose errors add up, and columns get matter behind every pixel of the input view.
 
     Args:
         views: of one moment, the input view first.
@@ -22,10 +26,13 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
         BadInput: the views have no common shape.
     """
     carving = _carving(views)
-    volume = hull(carving, CELLS)
-    if not shows_sides([view.camera for view in carving]):
-        return bounded(volume, carving, fitting_turn(carving))
-    return probable(volume, views, predict) if predict is not None and leaves_doubt(views) else volume
+    if leaves_doubt(views):
+        volume = hull(carving, CELLS)
+        return probable(volume, views, predict) if predict is not None else volume
+    if shows_sides([view.camera for view in carving]):
+        return covering(hull(carving, CELLS, reach=REACH, lenience=LENIENCE), views[0])
+    columns = bounded(hull(carving, CELLS, reach=REACH), carving, fitting_turn(carving))
+    return covering(columns, views[0])
 
 
 def leaves_doubt(views: Sequence[KnownView]) -> bool:

@@ -53,24 +53,31 @@ def surface_tracker(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
 ) -> Track:
-    """Return what moves the surface of known views of the first frame; arguments as of `track_surface`."""
+    """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
-    def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> MovedSurfaces:
-        return MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
+    Where views are all around, or the hull of few sides loses the outline, optical flow and descent are both tried, and
+    the motion whose silhouettes overlap more with the video's wins.
+    """
+
+    def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
+        moved = MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
+        return _overlap(moved, video), moved
 
     def track(surface: InflatedSurface) -> MovedSurfaces:
         settings = tracking_of(known)
-        moved = follow(surface, settings, report)
-        if settings is not SOFT or not shows_sides([OrbitCamera(), *known.cameras]):
-            return moved
-        overlap = _overlap(moved, video)
-        if overlap >= LOST:
+        overlap, moved = follow(surface, settings, report)
+        if not _tries_both(settings, overlap, known):
             return moved
         done = iterations(settings, len(video))
-        other = follow(surface, FLOW, lambda _, values: report(done, values))
-        return other if _overlap(other, video) > overlap else moved
+        second, other = follow(surface, SOFT if settings is FLOW else FLOW, lambda _, values: report(done, values))
+        return other if second > overlap else moved
 
     return track
+
+
+def _tries_both(settings: AssetSettings, overlap: float, known: Bank) -> bool:
+    """Return True if a hull is also tracked the other way: by descent always, as it is quick."""
+    return settings is FLOW or (overlap < LOST and shows_sides([OrbitCamera(), *known.cameras]))
 
 
 def _overlap(moved: MovedSurfaces, video: DrivingVideo) -> float:

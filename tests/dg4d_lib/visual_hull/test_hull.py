@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from creatures import alpha_of, creature, known_surface, ring, seen
@@ -45,6 +46,14 @@ def test_two_orthogonal_views_of_a_disc_leave_no_corners():
         ) / volume.step
         inside = [bool(volume.values[tuple(cell.round().long().tolist())] > 0) for cell in cells]
         assert inside == [corners_stay, True]
+
+
+def test_lenience_widens_the_silhouettes_of_other_views():
+    one, other = hull(ring(4), 64), hull(ring(4), 64, lenience=0.5)
+    near = np.abs(one.values) < one.step  # not truncated
+    wider = (other.values - one.values)[near]
+    assert wider.min() > -1e-6 and wider.max() < 0.51 * one.step
+    assert (wider > 0.49 * one.step).mean() > 0.4  # where the first view, or rounding, bounds the hull, nothing changes
 
 
 def test_silhouettes_without_a_common_shape_are_refused():
