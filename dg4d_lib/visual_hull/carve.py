@@ -81,7 +81,7 @@ def hull(
         cells: along the longest side of the subject.
         exponent: of the superellipse that two orthogonal views get; more views get a larger one, so that corners stay.
         reach: distance outside of the hull to which the field is exact, world units; at least `TRUNCATION` cells.
-        lenience: cells by which the silhouettes of all views but the first are wider.
+        lenience: cells by which the silhouettes of views that are not sure, with weights below 1, are wider.
 
     Raises:
         BadInput: a picture shows no subject, or no place is inside of all silhouettes.
@@ -94,7 +94,7 @@ def hull(
     axes = [torch.arange(float(a), float(b) + step, step) for a, b in zip(low, high, strict=True)]
     points = torch.cartesian_prod(*axes)
     lowest = -max(reach, TRUNCATION * step)
-    wider = [lenience * step * (number > 0) for number in range(len(silhouettes))]
+    wider = [lenience * step * (view.weight < 1) for view in views]
     field = torch.cat([_margins(silhouettes, part, step, power, lowest, wider) for part in points.split(CHUNK)])
     values = field.reshape([len(axis) for axis in axes]).numpy()
     if not (values > 0).any():

@@ -10,7 +10,7 @@ from dg4d_lib.visual_hull.probable import Predict, probable
 
 CELLS = 128  # along the longest side of the subject
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
-LENIENCE = 0.5  # cells by which their silhouettes are wider: angles of turntables and of drawn views are a little wrong
+LENIENCE = 0.5  # cells by which silhouettes of drawn views are wider: these are a little wrong
 
 
 def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> Volume:

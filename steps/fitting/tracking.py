@@ -45,6 +45,12 @@ def tracking_of(known: Bank) -> AssetSettings:
     return FLOW if len(known.cameras) >= ALL_AROUND else SOFT
 
 
+def tracking_iterations(known: Bank, frames: int) -> int:
+    """Return the largest number of iterations that the tracker reports."""
+    first = tracking_of(known)
+    return iterations(first, frames) + (iterations(SOFT, frames) if first is FLOW else 0)
+
+
 def surface_tracker(
     gaussians: Gaussians,
     video: DrivingVideo,
@@ -68,8 +74,12 @@ def surface_tracker(
         overlap, moved = follow(surface, settings, report)
         if not _tries_both(settings, overlap, known):
             return moved
-        done = iterations(settings, len(video))
-        second, other = follow(surface, SOFT if settings is FLOW else FLOW, lambda _, values: report(done, values))
+        done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
+        second, other = follow(
+            surface,
+            SOFT if settings is FLOW else FLOW,
+            lambda iteration, values: report(min(done + iteration, most), values),
+        )
         return other if second > overlap else moved
 
     return track

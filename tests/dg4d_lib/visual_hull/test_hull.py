@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -48,8 +50,11 @@ def test_two_orthogonal_views_of_a_disc_leave_no_corners():
         assert inside == [corners_stay, True]
 
 
-def test_lenience_widens_the_silhouettes_of_other_views():
-    one, other = hull(ring(4), 64), hull(ring(4), 64, lenience=0.5)
+def test_lenience_widens_the_silhouettes_of_views_that_are_not_sure():
+    sure = ring(4)
+    views = [sure[0], *(replace(view, weight=0.9) for view in sure[1:])]
+    np.testing.assert_array_equal(hull(sure, 64, lenience=0.5).values, hull(sure, 64).values)
+    one, other = hull(views, 64), hull(views, 64, lenience=0.5)
     near = np.abs(one.values) < one.step  # not truncated
     wider = (other.values - one.values)[near]
     assert wider.min() > -1e-6 and wider.max() < 0.51 * one.step
