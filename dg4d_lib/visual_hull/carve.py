@@ -81,7 +81,7 @@ def hull(
         cells: along the longest side of the subject.
         exponent: of the superellipse that two orthogonal views get; more views get a larger one, so that corners stay.
         reach: distance outside of the hull to which the field is exact, world units; at least `TRUNCATION` cells.
-        lenience: cells by which the silhouettes of views that are not sure, with weights below 1, are wider.
+        lenience: cells by which the silhouettes of unreliable views, with weights below 1, are wider.
 
     Raises:
         BadInput: a picture shows no subject, or no place is inside of all silhouettes.
@@ -176,11 +176,6 @@ def _margins(
         left = left[field[left] > lowest]
     rounded = (1 - places.clamp(min=1e-6) ** (1 / power)) * limit * 4
     return torch.minimum(field, rounded).clamp(lowest, limit)
-
-
-def margins_inside(view: KnownView, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Return the margins of points inside of the silhouette of a view, world units."""
-    return _silhouettes([view])[0].sample(points)[0]
 
 
 def margins_of(views: Sequence[KnownView], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

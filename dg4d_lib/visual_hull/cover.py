@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, margins_inside
+from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, margins_of
 from dg4d_lib.visual_hull.known import KnownView
 
 REACH = 0.08  # world units outside of the hull in which matter is searched
@@ -31,7 +31,7 @@ def covering(volume: Volume, view: KnownView) -> Volume:
     points = torch.from_numpy(volume.low) + near.nonzero() * volume.step
     margins = values[near]
     pixel, count = _pixels(points, view.camera, volume.step)
-    inside = margins_inside(view, points) > 0
+    inside = margins_of([view], points) > 0
     best = torch.full((count,), -torch.inf).scatter_reduce(0, pixel[inside], margins[inside], "amax")
     empty = inside & (best[pixel] <= 0)
     filled = torch.where(empty, margins - best[pixel] + NEARLY * volume.step, -torch.inf)

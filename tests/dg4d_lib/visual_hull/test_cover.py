@@ -6,7 +6,7 @@ import torch
 from creatures import alpha_of, creature, ring, seen
 
 from dg4d_lib.metrics.image import iou
-from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, hull, margins_inside
+from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, hull, margins_of
 from dg4d_lib.visual_hull.cover import REACH, covering
 from dg4d_lib.visual_hull.known import KnownView
 from dg4d_lib.visual_hull.shape import ALL_AROUND, CELLS, known_volume
@@ -50,7 +50,7 @@ def test_it_comes_back_at_its_depth(wrong: list[KnownView]) -> None:
 def test_matter_stays_inside_the_silhouette(wrong: list[KnownView]) -> None:
     volume = known_volume(wrong)
     cells = torch.from_numpy(volume.low) + torch.from_numpy(volume.values > 0).nonzero() * volume.step
-    assert float(margins_inside(wrong[0], cells).min()) > -volume.step
+    assert float(margins_of(wrong[:1], cells).min()) > -volume.step
 
 
 def test_right_views_need_nothing() -> None:

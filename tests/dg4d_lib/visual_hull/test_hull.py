@@ -50,7 +50,7 @@ def test_two_orthogonal_views_of_a_disc_leave_no_corners():
         assert inside == [corners_stay, True]
 
 
-def test_lenience_widens_the_silhouettes_of_views_that_are_not_sure():
+def test_lenience_widens_the_silhouettes_of_unreliable_views():
     sure = ring(4)
     views = [sure[0], *(replace(view, weight=0.9) for view in sure[1:])]
     np.testing.assert_array_equal(hull(sure, 64, lenience=0.5).values, hull(sure, 64).values)
