@@ -25,6 +25,7 @@ SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
 LOST = 0.85  # overlap of silhouettes with the video, IoU, below which flow has a try at hulls with sides, too
+FOLLOWED = 0.92  # likewise, below which descent has a try at hulls of many views: above, the overlap does not tell
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -61,8 +62,8 @@ def surface_tracker(
 ) -> Track:
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
-    Where views are all around, or the hull of few sides loses the outline, optical flow and descent are both tried, and
-    the motion whose silhouettes overlap more with the video's wins.
+    Where a hull with sides loses the outline, optical flow and descent are both tried, and the motion whose silhouettes
+    overlap more with the video's wins.
     """
 
     def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
@@ -86,8 +87,10 @@ def surface_tracker(
 
 
 def _tries_both(settings: AssetSettings, overlap: float, known: Bank) -> bool:
-    """Return True if a hull is also tracked the other way: by descent always, as it is quick."""
-    return settings is FLOW or (overlap < LOST and shows_sides([OrbitCamera(), *known.cameras]))
+    """Return True if a hull that was tracked one way is also tracked the other way."""
+    if settings is FLOW:
+        return overlap < FOLLOWED
+    return overlap < LOST and shows_sides([OrbitCamera(), *known.cameras])
 
 
 def _overlap(moved: MovedSurfaces, video: DrivingVideo) -> float:

@@ -44,7 +44,8 @@ def views(azimuths_deg: list[float]) -> Bank:
         ([90, 180], 0.4, 0.1, ["soft", "flow"], "flow"),
         ([90, 180], 0.3, 0.4, ["soft", "flow"], "soft"),
         ([180], 0.4, 0.1, ["soft"], "soft"),  # the depth is a guess
-        (list(range(0, 360, 20)), 0.4, 0.0, ["flow", "soft"], "flow"),  # descent always has a try
+        (list(range(0, 360, 20)), 0.4, 0.0, ["flow"], "flow"),  # follows well: descent has no try
+        (list(range(0, 360, 20)), 0.4, 0.1, ["flow", "soft"], "flow"),
         (list(range(0, 360, 20)), 0.0, 0.1, ["flow", "soft"], "soft"),
     ],
 )
