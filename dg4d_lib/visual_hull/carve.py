@@ -94,8 +94,7 @@ def hull(
     axes = [torch.arange(float(a), float(b) + step, step) for a, b in zip(low, high, strict=True)]
     points = torch.cartesian_prod(*axes)
     lowest = -max(reach, TRUNCATION * step)
-    wider = [lenience * step * (view.weight < 1) for view in views]
-    field = torch.cat([_margins(silhouettes, part, step, power, lowest, wider) for part in points.split(CHUNK)])
+    field = torch.cat([_margins(silhouettes, part, step, power, lowest, lenience) for part in points.split(CHUNK)])
     values = field.reshape([len(axis) for axis in axes]).numpy()
     if not (values > 0).any():
         raise BadInput(_apart(views))
@@ -162,16 +161,17 @@ def _bounds(silhouettes: Sequence[_Silhouette]) -> tuple[Float[Tensor, " 3"], Fl
 
 def _margins(
     silhouettes: Sequence[_Silhouette], points: Float[Tensor, "n 3"], step: float, power: float, lowest: float,
-    wider: Sequence[float],
+    lenience: float,
 ) -> Float[Tensor, " n"]:  # fmt: skip
     """Return the truncated field of points; each view sees those that the earlier ones left."""
     limit = TRUNCATION * step
     field = points.new_full((len(points),), limit)
     places = points.new_zeros(len(points))
     left = torch.arange(len(points))
-    for silhouette, slack in zip(silhouettes, wider, strict=True):
+    for silhouette in silhouettes:
         margin, place = silhouette.sample(points[left])
-        field[left] = torch.minimum(field[left], margin + slack)
+        margin += lenience * step * (silhouette.view.weight < 1)
+        field[left] = torch.minimum(field[left], margin)
         places[left] += silhouette.weight * place**power
         left = left[field[left] > lowest]
     rounded = (1 - places.clamp(min=1e-6) ** (1 / power)) * limit * 4

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, margins_of
-from dg4d_lib.visual_hull.known import KnownView
+from dg4d_lib.visual_hull.known import KnownView, places_before
 
 REACH = 0.08  # world units outside of the hull in which matter is searched
 NEARLY = 0.5  # cells by which a place may violate the silhouettes more than the best one behind its pixel
@@ -43,9 +43,7 @@ def covering(volume: Volume, view: KnownView) -> Volume:
 def _pixels(points: Float[Tensor, "n 3"], camera: OrbitCamera, step: float) -> tuple[Int[Tensor, " n"], int]:
     """Return the pixels (row by row) about as wide as a cell that show points, and the number of all pixels."""
     size = max(1, round(step * camera.focal / camera.radius))
-    columns, rows = -(-camera.width // size), -(-camera.height // size)
-    matrix = camera.viewmat().float()
-    seen = points @ matrix[:3, :3].T + matrix[:3, 3]
-    middle = torch.tensor([camera.width / 2, camera.height / 2])
-    at = ((seen[:, :2] / seen[:, 2:].clamp(min=1e-3) * camera.focal + middle) / size).long()
-    return at[:, 1].clamp(0, rows - 1) * columns + at[:, 0].clamp(0, columns - 1), rows * columns
+    side = -(-camera.width // size)
+    at = (places_before(camera, points)[:, 1:] + 1) / 2 * camera.width / size
+    column, row = at.long().clamp(0, side - 1).T
+    return row * side + column, side**2

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.shape_prior.frustum import grid_places
 
 CARVES = 0.5  # weight from which the outline of a view bounds the hull
 SIDE_DEG = 50.0  # between views: less leaves the depth open, and the inflation bounds it
@@ -53,6 +54,12 @@ def angle_deg(one: OrbitCamera, other: OrbitCamera) -> float:
     """Return the angle between the directions of two cameras."""
     cosine = float(one.position() @ other.position()) / (one.radius * other.radius)
     return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+
+def places_before(camera: OrbitCamera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Return the places of points before a square camera: depth, column and row, in [-1, 1]; see `grid_places`."""
+    matrix = camera.viewmat().float()
+    return grid_places(*(points @ matrix[:3, :3].T + matrix[:3, 3]).T)
 
 
 def shows_sides(cameras: Sequence[OrbitCamera]) -> bool:

@@ -15,9 +15,9 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dg4d_lib.shape_prior.frustum import SIZE, grid_places
+from dg4d_lib.shape_prior.frustum import SIZE
 from dg4d_lib.visual_hull.carve import TRUNCATION, Volume
-from dg4d_lib.visual_hull.known import KnownView
+from dg4d_lib.visual_hull.known import KnownView, places_before
 
 NEARLY = 0.3  # log-odds by which a cell that stays may be less probable than the best one behind its pixel
 SMOOTH = 1.0  # cells: standard deviation of the filter over log-odds
@@ -57,9 +57,7 @@ def _seen(
     points: Float[Tensor, "n 3"], view: KnownView, logits: Float[Tensor, "128 128 64"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
     """Return the log-odds of points before the camera of a view, and the pixels (row by row) that show them."""
-    matrix = view.camera.viewmat().float()
-    places = points @ matrix[:3, :3].T + matrix[:3, 3]
-    at = grid_places(*places.T)
+    at = places_before(view.camera, points)
     found = grid_sample(logits[None, None], at[None, None, None], align_corners=False, padding_mode="border")[
         0, 0, 0, 0
     ]

@@ -1,6 +1,6 @@
 """Cavities of a density field, and cells whose isosurface is ambiguous.
 
-Solid are the samples at or above a level, the others are empty.
+Samples at or above a level are solid, the others are empty.
 """
 
 import itertools
