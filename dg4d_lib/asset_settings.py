@@ -198,6 +198,11 @@ class AssetSettings(Settings):
     color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
     alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
     flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
+    integrate_rotations: bool = Field(
+        False,
+        description="place the nodes by their rotations, for wings and limbs that swing far; the descent of a frame "
+        "then starts from the best of several speeds and of the frame that looks most alike",
+    )
     rigidity: NotNegative = Field(1.0, description="as-rigid-as-possible energy of the surface")
     bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
     rigidity_loss: Literal["l1", "log", "best"] = Field(

@@ -10,8 +10,9 @@ from torch import Tensor
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
 from dg4d_lib.deformation.framewise import Framewise
-from dg4d_lib.fitting.asset_motion import NodeMotion, fit_asset_motion, iterations
+from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
+from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat

@@ -7,7 +7,7 @@ video leaves open; accelerations, and displacements in depth and out of the plan
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float, Int
 from skimage.registration import optical_flow_tvl1
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, FlowTracker, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, resize_cutouts
+from dg4d_lib.fitting.node_motion import NodeBasis, NodeDescent, NodeMotion, NodeVariables
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -40,56 +40,8 @@ MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 EXPLAINED = 0.04  # error of the first frame up to which the model is at rest there
-SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
-BETA1, BETA2 = 0.9, 0.99  # of Adam
-FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
+SPEEDS = (0.0, 0.5, 1.0)  # shares of the last speed that a frame may start with, where rotations are integrated
 Report = Callable[[int, dict[str, float]], None]
-
-
-@dataclass(frozen=True)
-class NodeMotion:
-    """Rigid transforms of the nodes at every frame, and of the whole model.
-
-    Attributes:
-        quats: rotations of the nodes, wxyz, any non-zero norm.
-        shifts: translations of the nodes.
-        whole_quats: rotation of everything about the centroid of the nodes.
-        whole_shifts: translation of everything.
-    """
-
-    quats: Float[Tensor, "t m 4"]
-    shifts: Float[Tensor, "t m 3"]
-    whole_quats: Float[Tensor, "t 4"]
-    whole_shifts: Float[Tensor, "t 3"]
-
-    def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
-        """Return the motion of some frames."""
-        return NodeMotion(**{name: value[frames] for name, value in vars(self).items()})
-
-    def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
-        """Return the points that the nodes of `graph` move, at every frame."""
-        matrices = quat_to_rotmat(self.quats)  # t m 3 3
-        origins = graph.nodes + self.shifts - (matrices @ graph.nodes[..., None])[..., 0]  # x -> R x + origin
-        affine = torch.cat([matrices, origins[..., None]], -1).flatten(2)  # t m 12
-        blended = graph.blend(affine).unflatten(-1, (3, 4))
-        moved = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
-        return self._placed(moved, graph)
-
-    def nodes(self, graph: ControlGraph) -> Float[Tensor, "t m 3"]:
-        """Return the nodes at every frame."""
-        return self._placed(graph.nodes + self.shifts, graph)
-
-    def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
-        """Return the blended rotations of the points, unit quaternions."""
-        unit = functional.normalize(self.quats, dim=-1)
-        blended = functional.normalize(graph.blend(unit), dim=-1)
-        whole = functional.normalize(self.whole_quats, dim=-1)
-        return quat_multiply(whole[:, None].expand_as(blended), blended)
-
-    def _placed(self, points: Float[Tensor, "t v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
-        center = graph.nodes.mean(0)
-        turned = (points - center) @ quat_to_rotmat(self.whole_quats).mT
-        return turned + center + self.whole_shifts[:, None]
 
 
 def fit_asset_motion(
@@ -148,24 +100,24 @@ def _fitted(
     """Track all frames, then refine them together."""
     frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
-    unknowns = _Unknowns.joined(track(fit, video, settings, report))
-    descent = _Descent(unknowns)
+    variables = NodeVariables.joined(track(fit, video, settings, report))
+    descent = NodeDescent(variables, fit.basis)
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
-        moved = unknowns.motion(fit.smoothing)
+        moved = variables.motion(fit.basis)
         losses = fit.losses(moved.at(chosen), chosen.tolist())
         if frames > 2:
             nodes = moved.nodes(fit.graph)
             acceleration = fit.relative(nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
             losses["inertia"] = settings.smoothness * acceleration.square().sum(-1).mean()
-        fit.step(losses, unknowns, f"joint iteration {step + 1}")
+        fit.step(losses, variables, f"joint iteration {step + 1}")
         descent.step(0.5 * settings.lr * (1 - 0.9 * step / settings.joint_iterations))
         done += 1
         report(done, {name: float(value.detach()) for name, value in losses.items()})
-    return unknowns.detach().motion(fit.smoothing)
+    return variables.detach().motion(fit.basis)
 
 
-def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["NodeVariables"]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
@@ -174,7 +126,7 @@ def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report:
         for number, frame in enumerate(order[1:], 1):
             poses[frame] = tracker.tracked(poses, order[:number], frame)
             report(len(poses) * settings.track_iterations, {"color": tracker.error(poses[frame], frame)})
-    return [_Unknowns.of(poses[frame], fit.smoothing) for frame in range(len(video))]
+    return [NodeVariables.of(poses[frame], fit.basis) for frame in range(len(video))]
 
 
 def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
@@ -193,29 +145,29 @@ def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     return followed
 
 
-def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["_Unknowns"]:
+def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["NodeVariables"]:
     """Track the frames one after the other along gradients; return their variables."""
     done = 0
-    tracked: list[_Unknowns] = [_Unknowns.still(1, fit.graph)]
+    tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)]
     for frame in range(len(video)):
-        start = tracked[-1] if frame < 2 else tracked[-2].continued(tracked[-1])
-        unknowns, steps = start.copy(), settings.track_iterations
-        descent = _Descent(unknowns)
-        expected = start.motion(fit.smoothing).nodes(fit.graph).detach()
-        targets = fit.flow_targets(tracked[-1].motion(fit.smoothing), frame) if frame else None
+        start = fit.start(tracked, frame)
+        variables, steps = start.copy(), settings.track_iterations
+        descent = NodeDescent(variables, fit.basis)
+        expected = start.motion(fit.basis).nodes(fit.graph).detach()
+        targets = fit.flow_targets(tracked[-1].motion(fit.basis), frame) if frame else None
         for step in range(steps):
-            moved = unknowns.motion(fit.smoothing)
+            moved = variables.motion(fit.basis)
             losses = fit.losses(moved, [frame])
             if targets is not None and step < FLOW_SHARE * steps:
                 losses["flow"] = settings.flow * fit.flow_loss(moved, *targets)
             losses["inertia"] = (
                 settings.inertia * fit.relative(moved.nodes(fit.graph) - expected).square().sum(-1).mean()
             )
-            fit.step(losses, unknowns, f"frame {frame}, iteration {step + 1}")
+            fit.step(losses, variables, f"frame {frame}, iteration {step + 1}")
             descent.step(settings.lr * (1 - 0.8 * step / steps))
             done += 1
             report(done, {name: float(value.detach()) for name, value in losses.items()})
-        tracked.append(unknowns.detach())
+        tracked.append(variables.detach())
     return tracked[1:]
 
 
@@ -241,7 +193,7 @@ class _Fit:
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         first, second = graph.edges.T
-        self.smoothing = _smoothing(graph, settings.smoothing)
+        self.basis = NodeBasis(graph, settings.smoothing, settings.integrate_rotations)
         self.spans = graph.nodes[second] - graph.nodes[first]
 
     def match_first_frame(self, pose: Pose) -> Gaussians:
@@ -250,7 +202,7 @@ class _Fit:
         Returns:
             The Gaussians that the fit renders from now on.
         """
-        motion = _Unknowns.of(pose, self.smoothing).motion(self.smoothing)
+        motion = NodeVariables.of(pose, self.basis).motion(self.basis)
         means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
         names = ("harmonics", "opacity_logits", "log_scales")
         values = {name: getattr(self.plain, name).clone().requires_grad_() for name in names}
@@ -275,6 +227,24 @@ class _Fit:
     def relative(self, values: Tensor) -> Tensor:
         """Return lengths in tenths of the model's size."""
         return values / self.unit
+
+    @torch.no_grad()
+    def start(self, tracked: Sequence[NodeVariables], frame: int) -> NodeVariables:
+        """Return where the descent of a frame starts, after those before it, the first of which is at rest.
+
+        Where rotations are integrated, the best of several speeds and of the frame that looks most alike is taken:
+        wings turn back, and steps repeat.
+        """
+        if frame < 2:
+            return tracked[-1]
+        if not self.basis.integrated:
+            return tracked[-2].continued(tracked[-1])
+        options = [tracked[-2].continued(tracked[-1], speed) for speed in SPEEDS]
+        picture = torch.cat([self.colors, self.alphas], -1)
+        errors = [float(pyramid_error(picture[frame : frame + 1], picture[k : k + 1])) for k in range(frame)]
+        options.append(tracked[1 + min(range(frame), key=errors.__getitem__)])
+        totals = [sum(map(float, self.losses(one.motion(self.basis), [frame]).values())) for one in options]
+        return options[min(range(len(options)), key=totals.__getitem__)]
 
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:
@@ -356,104 +326,14 @@ class _Fit:
         log = self.settings.rigidity_loss == "log"
         return _robust(stretch, log).mean() + self.settings.bending * _robust(bend, log).mean()
 
-    def step(self, losses: dict[str, Tensor], unknowns: "_Unknowns", place: str) -> None:
+    def step(self, losses: dict[str, Tensor], variables: "NodeVariables", place: str) -> None:
         """Compute the gradients of the sum of the losses."""
         total = torch.stack(list(losses.values())).sum()
-        for value in vars(unknowns).values():
+        for value in vars(variables).values():
             value.grad = None
         total.backward()
-        gradients = [value.grad for value in vars(unknowns).values()]
+        gradients = [value.grad for value in vars(variables).values()]
         check_finite("animate_asset", {"loss": total}, gradients, place, ADVICE, self.cloud)
-
-
-@dataclass(frozen=True)
-class _Unknowns:
-    """Variables of the fit: transforms of the nodes before smoothing over the graph, rotations as vectors.
-
-    Smoothing lets nodes that the video does not show move with those that it shows (Nicolet et al. 2021).
-    """
-
-    turns: Float[Tensor, "t m 3"]
-    shifts: Float[Tensor, "t m 3"]
-    whole_turns: Float[Tensor, "t 3"]
-    whole_shifts: Float[Tensor, "t 3"]
-
-    @classmethod
-    def still(cls, frames: int, graph: ControlGraph) -> "_Unknowns":
-        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
-        return cls(zeros, zeros, whole, whole)
-
-    @classmethod
-    def of(cls, pose: Pose, smoothing: Float[Tensor, "m m"]) -> "_Unknowns":
-        """Return the variables of a tracked pose."""
-        quats = pose.quats()
-        turns = 2 * quats[:, 1:] / quats[:, :1].clamp(min=SMALLEST_REAL)
-        shifts, whole = torch.from_numpy(pose.shifts).to(turns), turns.new_zeros(1, 3)
-        rough = [torch.linalg.solve(smoothing, one)[None] for one in (turns, shifts)]
-        return cls(rough[0], rough[1], whole, whole)
-
-    @classmethod
-    def joined(cls, frames: Sequence["_Unknowns"]) -> "_Unknowns":
-        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
-
-    def copy(self) -> "_Unknowns":
-        return _Unknowns(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
-
-    def detach(self) -> "_Unknowns":
-        return _Unknowns(**{name: value.detach() for name, value in vars(self).items()})
-
-    def continued(self, last: "_Unknowns") -> "_Unknowns":
-        """Continue from this frame over the last one, at half the speed."""
-        return _Unknowns(
-            **{name: getattr(last, name) + 0.5 * (getattr(last, name) - value) for name, value in vars(self).items()}
-        )
-
-    def motion(self, smoothing: Float[Tensor, "m m"]) -> NodeMotion:
-        """Return the motion that they stand for."""
-        return NodeMotion(
-            _quats(smoothing @ self.turns), smoothing @ self.shifts, _quats(self.whole_turns), self.whole_shifts
-        )
-
-
-class _Descent:
-    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak."""
-
-    def __init__(self, unknowns: _Unknowns) -> None:
-        self.values = vars(unknowns)
-        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
-        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
-        self.count = 0
-
-    @torch.no_grad()
-    def step(self, lr: float) -> None:
-        """Move all variables by their gradients."""
-        self.count += 1
-        for name, value in self.values.items():
-            if value.grad is None:
-                continue
-            first, second = self.first[name], self.second[name]
-            first.lerp_(value.grad, 1 - BETA1)
-            second.lerp_(value.grad.square(), 1 - BETA2)
-            largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
-            moment = first / (1 - BETA1**self.count)
-            value.sub_(lr * FACTORS[name] * moment / (largest.sqrt() + 1e-12))
-
-
-def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Return rotations for vectors along the axis of twice the tangent of half the angle."""
-    return torch.cat([torch.ones_like(turns[..., :1]), 0.5 * turns], -1)
-
-
-def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
-    """Return (I + strength L)^-1 with the Laplacian L of the graph, scaled to keep a uniform motion."""
-    count = len(graph.nodes)
-    laplacian = torch.zeros(count, count, dtype=torch.float64)
-    first, second = graph.edges.T
-    laplacian[first, second] = -1.0
-    laplacian[second, first] = -1.0
-    laplacian.diagonal().copy_(-laplacian.sum(1))
-    inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
-    return inverse.to(graph.nodes)
 
 
 def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:

@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from skimage.measure import perimeter
 from torch import Tensor
 
-from dg4d_lib.fitting.surface_tracking import DESCENT, track_vertices
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, WORSE, swinging, track_vertices
 from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
@@ -62,7 +63,16 @@ def follow_video(
         FitDiverged: the loss became non-finite.
     """
     rest = states.at(reference_frame)
-    moved = track_vertices(vertices, faces, rest, video, rasterize, TRACKING, generator, reference_frame)
+    silhouettes = render_silhouettes(states, range(len(video)), rasterize, video.alpha[..., 0])
+
+    def track(how: AssetSettings) -> tuple[float, Float[Tensor, "t v 3"]]:
+        moved = track_vertices(vertices, faces, rest, video, rasterize, how, generator, reference_frame)
+        return float(silhouette_iou(moved, faces, silhouettes).mean()), moved
+
+    overlap, moved = track(TRACKING)
+    if overlap < LOST:
+        second, other = track(swinging(TRACKING))
+        moved = other if second > overlap - WORSE else moved
     return register_to_outlines(
         vertices,
         moved - vertices,

@@ -33,7 +33,14 @@ DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for c
     whole_depth=0.15,
     across=0.0,
 )
+LOST = 0.85  # overlap of silhouettes with the video, IoU: less says nothing of which motion is the better one
+WORSE = 0.05  # by which it may then be smaller for swinging limbs, which do not stretch to fill an outline
 CELL = 0.02  # world units: vertices in one cell move alike; distances along a finer surface take a minute
+
+
+def swinging(settings: AssetSettings) -> AssetSettings:
+    """Return the settings of a descent for surfaces that lose the outline: wings and limbs that swing far."""
+    return settings.model_copy(update={"integrate_rotations": True, "rigidity": 0.5})
 
 
 def track_surface(

@@ -5,7 +5,7 @@ import torch
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import Report, iterations
-from dg4d_lib.fitting.surface_tracking import DESCENT, track_surface
+from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, WORSE, swinging, track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.moved import MovedSurfaces
@@ -15,7 +15,6 @@ from dg4d_lib.metrics.image import iou
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
-from dg4d_lib.visual_hull.known import shows_sides
 from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Track
 
@@ -24,8 +23,9 @@ FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
-LOST = 0.85  # overlap of silhouettes with the video, IoU, below which flow has a try at hulls with sides, too
-FOLLOWED = 0.92  # likewise, below which descent has a try at hulls of many views: above, the overlap does not tell
+SWING = swinging(SOFT)  # for what loses the outline
+FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, up to which flow is compared with the descent
+GAIN = 0.01  # by which the overlap must be larger, for what is not lost
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -49,7 +49,7 @@ def tracking_of(known: Bank) -> AssetSettings:
 def tracking_iterations(known: Bank, frames: int) -> int:
     """Return the largest number of iterations that the tracker reports."""
     first = tracking_of(known)
-    return iterations(first, frames) + (iterations(SOFT, frames) if first is FLOW else 0)
+    return iterations(first, frames) + (iterations(SWING, frames) if first is FLOW else 0)  # others are seldom lost
 
 
 def surface_tracker(
@@ -62,8 +62,8 @@ def surface_tracker(
 ) -> Track:
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
-    Where a hull with sides loses the outline, optical flow and descent are both tried, and the motion whose silhouettes
-    overlap more with the video's wins.
+    Where the surface loses the outline, it is tracked again with limbs that swing, and this motion is kept unless its
+    silhouettes say that it is the worse one.
     """
 
     def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
@@ -73,24 +73,14 @@ def surface_tracker(
     def track(surface: InflatedSurface) -> MovedSurfaces:
         settings = tracking_of(known)
         overlap, moved = follow(surface, settings, report)
-        if not _tries_both(settings, overlap, known):
+        if overlap >= (FOLLOWED if settings is FLOW else LOST):
             return moved
         done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
-        second, other = follow(
-            surface,
-            SOFT if settings is FLOW else FLOW,
-            lambda iteration, values: report(min(done + iteration, most), values),
-        )
-        return other if second > overlap else moved
+        second, other = follow(surface, SWING, lambda iteration, values: report(min(done + iteration, most), values))
+        least = overlap + GAIN if overlap >= LOST else overlap - WORSE
+        return other if second > least else moved
 
     return track
-
-
-def _tries_both(settings: AssetSettings, overlap: float, known: Bank) -> bool:
-    """Return True if a hull that was tracked one way is also tracked the other way."""
-    if settings is FLOW:
-        return overlap < FOLLOWED
-    return overlap < LOST and shows_sides([OrbitCamera(), *known.cameras])
 
 
 def _overlap(moved: MovedSurfaces, video: DrivingVideo) -> float:

@@ -1,0 +1,206 @@
+"""Motions of control nodes, and the variables that a descent finds them by.
+
+Variables are smoothed over the graph, so that nodes that the video does not show move with those that it shows
+(Nicolet et al. 2021). Where rotations are integrated, the nodes are placed by them (a Poisson equation, Yu et al. 2004)
+and shifts are added: a step that turns a shoulder swings the arm, where along shifts alone a raised wing would shrink.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.mesh.models.control_graph import ControlGraph
+
+SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
+BETA1, BETA2 = 0.9, 0.99  # of Adam
+FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
+INTEGRATED_FACTORS = FACTORS | {"turns": 24.0, "shifts": 1.5}  # likewise, where rotations are integrated
+
+
+@dataclass(frozen=True)
+class NodeMotion:
+    """Rigid transforms of the nodes at every frame, and of the whole model.
+
+    Attributes:
+        quats: rotations of the nodes, wxyz, any non-zero norm.
+        shifts: translations of the nodes.
+        whole_quats: rotation of everything about the centroid of the nodes.
+        whole_shifts: translation of everything.
+    """
+
+    quats: Float[Tensor, "t m 4"]
+    shifts: Float[Tensor, "t m 3"]
+    whole_quats: Float[Tensor, "t 4"]
+    whole_shifts: Float[Tensor, "t 3"]
+
+    def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
+        """Return the motion of some frames."""
+        return NodeMotion(**{name: value[frames] for name, value in vars(self).items()})
+
+    def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
+        """Return the points that the nodes of `graph` move, at every frame."""
+        matrices = quat_to_rotmat(self.quats)  # t m 3 3
+        origins = graph.nodes + self.shifts - (matrices @ graph.nodes[..., None])[..., 0]  # x -> R x + origin
+        affine = torch.cat([matrices, origins[..., None]], -1).flatten(2)  # t m 12
+        blended = graph.blend(affine).unflatten(-1, (3, 4))
+        moved = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+        return self._placed(moved, graph)
+
+    def nodes(self, graph: ControlGraph) -> Float[Tensor, "t m 3"]:
+        """Return the nodes at every frame."""
+        return self._placed(graph.nodes + self.shifts, graph)
+
+    def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
+        """Return the blended rotations of the points, unit quaternions."""
+        unit = functional.normalize(self.quats, dim=-1)
+        blended = functional.normalize(graph.blend(unit), dim=-1)
+        whole = functional.normalize(self.whole_quats, dim=-1)
+        return quat_multiply(whole[:, None].expand_as(blended), blended)
+
+    def _placed(self, points: Float[Tensor, "t v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
+        center = graph.nodes.mean(0)
+        turned = (points - center) @ quat_to_rotmat(self.whole_quats).mT
+        return turned + center + self.whole_shifts[:, None]
+
+
+class NodeBasis:
+    """What turns variables into motions: smoothing over the graph, and the integration of rotations.
+
+    Attributes:
+        smoothing: matrix that variables of the nodes are multiplied by.
+        integrated: rotations are integrated.
+    """
+
+    def __init__(self, graph: ControlGraph, strength: float, integrated: bool) -> None:
+        self.smoothing = _smoothing(graph, strength)
+        self.integrated = integrated
+        self._graph = graph
+        first, second = graph.edges.T
+        self._spans = graph.nodes[second] - graph.nodes[first]
+        self._centered = graph.nodes - graph.nodes.mean(0)
+        self._integral = _integral(graph) if integrated else None
+
+    def integral(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t m 3"]:
+        """Return the shifts, mean 0, that fit rotations best: every edge turns as its ends do; 0 if not integrated."""
+        if self._integral is None:
+            return torch.zeros_like(quats[..., 1:])
+        first, second = self._graph.at_ends(quat_to_rotmat(quats).flatten(2))
+        turns = (0.5 * (first + second)).unflatten(-1, (3, 3))
+        return self._integral @ (turns @ self._spans[..., None])[..., 0] - self._centered
+
+
+@dataclass(frozen=True)
+class NodeVariables:
+    """Transforms of the nodes and of the whole before smoothing, rotations as vectors.
+
+    Attributes:
+        turns: along the axis, of twice the tangent of half the angle.
+        shifts: world units.
+        whole_turns: like `turns`, of everything.
+        whole_shifts: like `shifts`, of everything.
+    """
+
+    turns: Float[Tensor, "t m 3"]
+    shifts: Float[Tensor, "t m 3"]
+    whole_turns: Float[Tensor, "t 3"]
+    whole_shifts: Float[Tensor, "t 3"]
+
+    @classmethod
+    def still(cls, frames: int, graph: ControlGraph) -> "NodeVariables":
+        """Return the variables of nodes at rest."""
+        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
+        return cls(zeros, zeros, whole, whole)
+
+    @classmethod
+    def of(cls, pose: Pose, basis: NodeBasis) -> "NodeVariables":
+        """Return the variables of a tracked pose."""
+        quats = pose.quats()
+        turns = 2 * quats[:, 1:] / quats[:, :1].clamp(min=SMALLEST_REAL)
+        shifts, whole = torch.from_numpy(pose.shifts).to(turns), turns.new_zeros(1, 3)
+        remaining = shifts - basis.integral(quats[None])[0]
+        rough = [torch.linalg.solve(basis.smoothing, one)[None] for one in (turns, remaining)]
+        return cls(rough[0], rough[1], whole, whole)
+
+    @classmethod
+    def joined(cls, frames: Sequence["NodeVariables"]) -> "NodeVariables":
+        """Return the variables of several frames, ready for a descent."""
+        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
+
+    def copy(self) -> "NodeVariables":
+        """Return a copy that gradients are computed for."""
+        return NodeVariables(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
+
+    def detach(self) -> "NodeVariables":
+        """Return them without gradients."""
+        return NodeVariables(**{name: value.detach() for name, value in vars(self).items()})
+
+    def continued(self, last: "NodeVariables", speed: float = 0.5) -> "NodeVariables":
+        """Continue from this frame over the last one, at a share of the speed."""
+        return NodeVariables(
+            **{name: getattr(last, name) + speed * (getattr(last, name) - value) for name, value in vars(self).items()}
+        )
+
+    def motion(self, basis: NodeBasis) -> NodeMotion:
+        """Return the motion that they stand for."""
+        quats = _quats(basis.smoothing @ self.turns)
+        shifts = basis.smoothing @ self.shifts + basis.integral(quats)
+        return NodeMotion(quats, shifts, _quats(self.whole_turns), self.whole_shifts)
+
+
+class NodeDescent:
+    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak."""
+
+    def __init__(self, variables: NodeVariables, basis: NodeBasis) -> None:
+        self.values = vars(variables)
+        self.factors = INTEGRATED_FACTORS if basis.integrated else FACTORS
+        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.count = 0
+
+    @torch.no_grad()
+    def step(self, lr: float) -> None:
+        """Move all variables by their gradients."""
+        self.count += 1
+        for name, value in self.values.items():
+            if value.grad is None:
+                continue
+            first, second = self.first[name], self.second[name]
+            first.lerp_(value.grad, 1 - BETA1)
+            second.lerp_(value.grad.square(), 1 - BETA2)
+            largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
+            moment = first / (1 - BETA1**self.count)
+            value.sub_(lr * self.factors[name] * moment / (largest.sqrt() + 1e-12))
+
+
+def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Return rotations for vectors along the axis of twice the tangent of half the angle."""
+    return torch.cat([torch.ones_like(turns[..., :1]), 0.5 * turns], -1)
+
+
+def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
+    """Return (I + strength L)^-1 with the Laplacian L of the graph, scaled to keep a uniform motion."""
+    count = len(graph.nodes)
+    laplacian = torch.zeros(count, count, dtype=torch.float64)
+    first, second = graph.edges.T
+    laplacian[first, second] = -1.0
+    laplacian[second, first] = -1.0
+    laplacian.diagonal().copy_(-laplacian.sum(1))
+    inverse: Tensor = torch.linalg.inv(torch.eye(count, dtype=torch.float64) + strength * laplacian)
+    return inverse.to(graph.nodes)
+
+
+def _integral(graph: ControlGraph) -> Float[Tensor, "m e"]:
+    """Return the matrix from edges to the nodes, mean 0, that fit them best in relative length."""
+    first, second = graph.edges.T
+    rows, weights = torch.arange(len(first)), graph.lengths.double() ** -2
+    ends = torch.zeros(len(first), len(graph.nodes), dtype=torch.float64)
+    ends[rows, first], ends[rows, second] = -1.0, 1.0
+    laplacian = ends.T @ (weights[:, None] * ends)
+    inverse: Tensor = torch.linalg.pinv(laplacian, hermitian=True) @ (ends.T * weights)
+    return inverse.to(graph.nodes)
