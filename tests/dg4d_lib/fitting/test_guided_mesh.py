@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting import guided_mesh
 from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, select_guided_reference
@@ -92,6 +93,39 @@ def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None
     followed = silhouette_iou(vertices + offsets, faces, silhouettes)
     assert still[FRAMES // 2 :].min() < 0.75
     assert followed.min() > 0.8 and followed.mean() > 0.87
+
+
+@pytest.mark.parametrize(
+    ("away", "swinging_away", "ways", "kept"),
+    [(0.0, 0.0, 1, 0.0), (0.1, 0.0, 2, 0.0), (0.1, 0.1, 2, 0.1), (0.1, 0.4, 2, 0.1)],
+)
+def test_a_mesh_that_loses_the_outline_is_tracked_with_limbs_that_swing(
+    monkeypatch: pytest.MonkeyPatch, away: float, swinging_away: float, ways: int, kept: float
+) -> None:
+    ball = trimesh.creation.icosphere(3, 0.3)
+    vertices, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces)
+    points = vertices.expand(FRAMES, -1, -1)
+    count = len(vertices)
+    states = Gaussians(
+        0.9 * points,  # splats are seen beyond their centers
+        torch.full((FRAMES, count, 3), -4.0),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(FRAMES, count, 4),
+        torch.full((count,), 3.0),
+        torch.zeros(1, 1, 3).expand(count, 1, 3),
+    )
+    tracked: list[bool] = []
+
+    def track(*arguments: object) -> torch.Tensor:
+        settings = next(one for one in arguments if isinstance(one, AssetSettings))
+        tracked.append(settings.integrate_rotations)
+        return points + torch.tensor([swinging_away if settings.integrate_rotations else away, 0, 0])
+
+    monkeypatch.setattr(guided_mesh, "track_vertices", track)
+    monkeypatch.setattr(guided_mesh, "register_to_outlines", lambda vertices, offsets, *_, **__: offsets)
+    generator = torch.Generator()
+    offsets = follow_video(vertices, faces, states, video_of(states), 0, 0.5, RASTERIZE, SETTINGS, generator)
+    assert tracked == [False, True][:ways]
+    assert float(offsets[1, :, 0].mean()) == pytest.approx(kept, abs=1e-5)
 
 
 @pytest.mark.slow
