@@ -117,7 +117,7 @@ def _fitted(
     return variables.detach().motion(fit.basis)
 
 
-def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["NodeVariables"]:
+def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
@@ -145,7 +145,7 @@ def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     return followed
 
 
-def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list["NodeVariables"]:
+def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames one after the other along gradients; return their variables."""
     done = 0
     tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)]
@@ -326,7 +326,7 @@ class _Fit:
         log = self.settings.rigidity_loss == "log"
         return _robust(stretch, log).mean() + self.settings.bending * _robust(bend, log).mean()
 
-    def step(self, losses: dict[str, Tensor], variables: "NodeVariables", place: str) -> None:
+    def step(self, losses: dict[str, Tensor], variables: NodeVariables, place: str) -> None:
         """Compute the gradients of the sum of the losses."""
         total = torch.stack(list(losses.values())).sum()
         for value in vars(variables).values():

@@ -24,7 +24,7 @@ SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
 SWING = swinging(SOFT)  # for what loses the outline
-FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, up to which flow is compared with the descent
+FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 GAIN = 0.01  # by which the overlap must be larger, for what is not lost
 
 
@@ -63,7 +63,8 @@ def surface_tracker(
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
     Where the surface loses the outline, it is tracked again with limbs that swing, and this motion is kept unless its
-    silhouettes say that it is the worse one.
+    silhouettes say that it is the worse one. Where flow follows the outline, but not well, the surface is tracked along
+    gradients, too, and this motion is kept if its silhouettes say that it is the better one.
     """
 
     def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
@@ -76,8 +77,8 @@ def surface_tracker(
         if overlap >= (FOLLOWED if settings is FLOW else LOST):
             return moved
         done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
-        second, other = follow(surface, SWING, lambda iteration, values: report(min(done + iteration, most), values))
-        least = overlap + GAIN if overlap >= LOST else overlap - WORSE
+        again, least = (SWING, overlap - WORSE) if overlap < LOST else (SOFT, overlap + GAIN)
+        second, other = follow(surface, again, lambda iteration, values: report(min(done + iteration, most), values))
         return other if second > least else moved
 
     return track
