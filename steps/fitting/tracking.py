@@ -63,8 +63,7 @@ def surface_tracker(
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
     Where the surface loses the outline, it is tracked again with limbs that swing, and this motion is kept unless its
-    silhouettes say that it is the worse one. Where flow follows the outline, but not well, the surface is tracked along
-    gradients, too, and this motion is kept if its silhouettes say that it is the better one.
+    silhouettes are much worse; where flow follows the outline, but not well, likewise, if its silhouettes are better.
     """
 
     def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
@@ -77,8 +76,8 @@ def surface_tracker(
         if overlap >= (FOLLOWED if settings is FLOW else LOST):
             return moved
         done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
-        again, least = (SWING, overlap - WORSE) if overlap < LOST else (SOFT, overlap + GAIN)
-        second, other = follow(surface, again, lambda iteration, values: report(min(done + iteration, most), values))
+        least = overlap - WORSE if overlap < LOST else overlap + GAIN
+        second, other = follow(surface, SWING, lambda iteration, values: report(min(done + iteration, most), values))
         return other if second > least else moved
 
     return track

@@ -49,8 +49,8 @@ ALL_AROUND = list(range(0, 360, 20))
         ([180], 0.1, 0.11, ["soft", "swing"], "swing"),  # lost: a smaller overlap does not tell
         ([90, 180], 0.1, 0.3, ["soft", "swing"], "soft"),  # far smaller
         (ALL_AROUND, 0.0, 0.0, ["flow"], "flow"),
-        (ALL_AROUND, 0.03, 0.0, ["flow", "soft"], "soft"),
-        (ALL_AROUND, 0.03, 0.03, ["flow", "soft"], "flow"),  # not lost, and no gain
+        (ALL_AROUND, 0.03, 0.0, ["flow", "swing"], "swing"),
+        (ALL_AROUND, 0.03, 0.03, ["flow", "swing"], "flow"),  # not lost, and no gain
         (ALL_AROUND, 0.1, 0.11, ["flow", "swing"], "swing"),
     ],
 )
