@@ -200,8 +200,8 @@ class AssetSettings(Settings):
     flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
     integrate_rotations: bool = Field(
         False,
-        description="place the nodes by their rotations, for wings and limbs that swing far; the descent of a frame "
-        "then starts from the best of several speeds and of the frame that looks most alike",
+        description="positions of nodes follow from their rotations (a Poisson equation), for wings and limbs that "
+        "swing far; with `tracking=flow`, in the joint iterations only",
     )
     rigidity: NotNegative = Field(1.0, description="as-rigid-as-possible energy of the surface")
     bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")

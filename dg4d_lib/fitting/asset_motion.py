@@ -22,7 +22,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, FlowTracker, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, resize_cutouts
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeDescent, NodeMotion, NodeVariables
-from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.node_pose import CONTINUED, Pose
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import thinned
@@ -40,7 +40,7 @@ MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
 ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 EXPLAINED = 0.04  # error of the first frame up to which the model is at rest there
-SPEEDS = (0.0, 0.5, 1.0)  # shares of the last speed that a frame may start with, where rotations are integrated
+SPEEDS = (0.0, CONTINUED, 1.0)  # extrapolations of the last motion that are tried, where rotations are integrated
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -192,9 +192,8 @@ class _Fit:
         self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
-        first, second = graph.edges.T
         self.basis = NodeBasis(graph, settings.smoothing, settings.integrate_rotations)
-        self.spans = graph.nodes[second] - graph.nodes[first]
+        self.spans = graph.spans
 
     def match_first_frame(self, pose: Pose) -> Gaussians:
         """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's.
@@ -232,19 +231,18 @@ class _Fit:
     def start(self, tracked: Sequence[NodeVariables], frame: int) -> NodeVariables:
         """Return where the descent of a frame starts, after those before it, the first of which is at rest.
 
-        Where rotations are integrated, the best of several speeds and of the frame that looks most alike is taken:
-        wings turn back, and steps repeat.
+        Where rotations are integrated, it is the extrapolation at one of several speeds, or the variables of the frame
+        with the most similar picture, whichever has the smallest loss: wings turn back, and steps repeat.
         """
         if frame < 2:
             return tracked[-1]
         if not self.basis.integrated:
             return tracked[-2].continued(tracked[-1])
-        options = [tracked[-2].continued(tracked[-1], speed) for speed in SPEEDS]
+        starts = [tracked[-2].continued(tracked[-1], speed) for speed in SPEEDS]
         picture = torch.cat([self.colors, self.alphas], -1)
         errors = [float(pyramid_error(picture[frame : frame + 1], picture[k : k + 1])) for k in range(frame)]
-        options.append(tracked[1 + min(range(frame), key=errors.__getitem__)])
-        totals = [sum(map(float, self.losses(one.motion(self.basis), [frame]).values())) for one in options]
-        return options[min(range(len(options)), key=totals.__getitem__)]
+        starts.append(tracked[1 + min(range(frame), key=errors.__getitem__)])
+        return min(starts, key=lambda one: sum(map(float, self.losses(one.motion(self.basis), [frame]).values())))
 
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:

@@ -10,7 +10,7 @@ from skimage.measure import perimeter
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, WORSE, swinging, track_vertices
+from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, swinging, swinging_is_better, track_vertices
 from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import density_field
@@ -48,6 +48,8 @@ def follow_video(
 ) -> Float[Tensor, "t v 3"]:
     """Return the offsets by which the surface of one frame follows the driving video.
 
+    A surface that loses the outline is tracked a second time, with limbs that swing.
+
     Args:
         vertices: surface of the reference frame, not split along seams.
         faces: counter-clockwise seen from outside.
@@ -65,14 +67,14 @@ def follow_video(
     rest = states.at(reference_frame)
     silhouettes = render_silhouettes(states, range(len(video)), rasterize, video.alpha[..., 0])
 
-    def track(how: AssetSettings) -> tuple[float, Float[Tensor, "t v 3"]]:
-        moved = track_vertices(vertices, faces, rest, video, rasterize, how, generator, reference_frame)
+    def track(tracking: AssetSettings) -> tuple[float, Float[Tensor, "t v 3"]]:
+        moved = track_vertices(vertices, faces, rest, video, rasterize, tracking, generator, reference_frame)
         return float(silhouette_iou(moved, faces, silhouettes).mean()), moved
 
     overlap, moved = track(TRACKING)
     if overlap < LOST:
         second, other = track(swinging(TRACKING))
-        moved = other if second > overlap - WORSE else moved
+        moved = other if swinging_is_better(overlap, second) else moved
     return register_to_outlines(
         vertices,
         moved - vertices,

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.node_pose import CONTINUED, Pose
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
@@ -70,24 +70,23 @@ class NodeMotion:
 
 
 class NodeBasis:
-    """What turns variables into motions: smoothing over the graph, and the integration of rotations.
+    """Map from the variables of a descent to motions: smoothing over the graph, and Poisson integration of rotations.
 
     Attributes:
-        smoothing: matrix that variables of the nodes are multiplied by.
-        integrated: rotations are integrated.
+        smoothing: matrix that the variables of the nodes are multiplied by.
+        integrated: the shifts that follow from the rotations are added to the variables'.
     """
 
     def __init__(self, graph: ControlGraph, strength: float, integrated: bool) -> None:
         self.smoothing = _smoothing(graph, strength)
         self.integrated = integrated
         self._graph = graph
-        first, second = graph.edges.T
-        self._spans = graph.nodes[second] - graph.nodes[first]
+        self._spans = graph.spans
         self._centered = graph.nodes - graph.nodes.mean(0)
         self._integral = _integral(graph) if integrated else None
 
     def integral(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t m 3"]:
-        """Return the shifts, mean 0, that fit rotations best: every edge turns as its ends do; 0 if not integrated."""
+        """Return the shifts, mean 0, that turn every edge as its ends turn, in least squares; 0 if not integrated."""
         if self._integral is None:
             return torch.zeros_like(quats[..., 1:])
         first, second = self._graph.at_ends(quat_to_rotmat(quats).flatten(2))
@@ -137,17 +136,17 @@ class NodeVariables:
         return NodeVariables(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
 
     def detach(self) -> "NodeVariables":
-        """Return them without gradients."""
+        """Return the variables without gradients."""
         return NodeVariables(**{name: value.detach() for name, value in vars(self).items()})
 
-    def continued(self, last: "NodeVariables", speed: float = 0.5) -> "NodeVariables":
-        """Continue from this frame over the last one, at a share of the speed."""
+    def continued(self, last: "NodeVariables", speed: float = CONTINUED) -> "NodeVariables":
+        """Extrapolate from this frame over the last one, by a share of the motion between them."""
         return NodeVariables(
             **{name: getattr(last, name) + speed * (getattr(last, name) - value) for name, value in vars(self).items()}
         )
 
     def motion(self, basis: NodeBasis) -> NodeMotion:
-        """Return the motion that they stand for."""
+        """Return the motion of nodes and whole."""
         quats = _quats(basis.smoothing @ self.turns)
         shifts = basis.smoothing @ self.shifts + basis.integral(quats)
         return NodeMotion(quats, shifts, _quats(self.whole_turns), self.whole_shifts)
@@ -196,7 +195,7 @@ def _smoothing(graph: ControlGraph, strength: float) -> Float[Tensor, "m m"]:
 
 
 def _integral(graph: ControlGraph) -> Float[Tensor, "m e"]:
-    """Return the matrix from edges to the nodes, mean 0, that fit them best in relative length."""
+    """Return the matrix from vectors of the edges to node positions, mean 0: weighted least squares over lengths."""
     first, second = graph.edges.T
     rows, weights = torch.arange(len(first)), graph.lengths.double() ** -2
     ends = torch.zeros(len(first), len(graph.nodes), dtype=torch.float64)

@@ -33,14 +33,25 @@ DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for c
     whole_depth=0.15,
     across=0.0,
 )
-LOST = 0.85  # overlap of silhouettes with the video, IoU: less says nothing of which motion is the better one
-WORSE = 0.05  # by which it may then be smaller for swinging limbs, which do not stretch to fill an outline
+LOST = 0.85  # overlap of silhouettes with the video, IoU, below which it does not tell which motion is the better one
+WORSE = 0.05  # by which it may be smaller in a second try, for what is lost: limbs that swing do not stretch
+GAIN = 0.01  # by which it must be larger in a second try, for what is not lost
 CELL = 0.02  # world units: vertices in one cell move alike; distances along a finer surface take a minute
 
 
 def swinging(settings: AssetSettings) -> AssetSettings:
-    """Return the settings of a descent for surfaces that lose the outline: wings and limbs that swing far."""
+    """Return the settings of the second try for surfaces that lose the outline: wings and limbs that swing far."""
     return settings.model_copy(update={"integrate_rotations": True, "rigidity": 0.5})
+
+
+def swinging_is_better(overlap: float, swinging_overlap: float) -> bool:
+    """Return True if the motion of the second try is kept.
+
+    Args:
+        overlap: of silhouettes with the video in the first try, IoU, mean over frames.
+        swinging_overlap: likewise, in the second try.
+    """
+    return swinging_overlap > (overlap - WORSE if overlap < LOST else overlap + GAIN)
 
 
 def track_surface(

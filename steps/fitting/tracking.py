@@ -5,7 +5,7 @@ import torch
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import Report, iterations
-from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, WORSE, swinging, track_surface
+from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, swinging, swinging_is_better, track_surface
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.moved import MovedSurfaces
@@ -25,7 +25,6 @@ SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
 )
 SWING = swinging(SOFT)  # for what loses the outline
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
-GAIN = 0.01  # by which the overlap must be larger, for what is not lost
 
 
 def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank | None, frames: int) -> bool:
@@ -62,8 +61,8 @@ def surface_tracker(
 ) -> Track:
     """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
 
-    Where the surface loses the outline, it is tracked again with limbs that swing, and this motion is kept unless its
-    silhouettes are much worse; where flow follows the outline, but not well, likewise, if its silhouettes are better.
+    A surface that loses the outline, or that flow follows badly, is tracked a second time, with limbs that swing;
+    `swinging_is_better` chooses between the two motions.
     """
 
     def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
@@ -76,9 +75,8 @@ def surface_tracker(
         if overlap >= (FOLLOWED if settings is FLOW else LOST):
             return moved
         done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
-        least = overlap - WORSE if overlap < LOST else overlap + GAIN
         second, other = follow(surface, SWING, lambda iteration, values: report(min(done + iteration, most), values))
-        return other if second > least else moved
+        return other if swinging_is_better(overlap, second) else moved
 
     return track
 

@@ -88,8 +88,7 @@ def test_a_surface_that_loses_the_outline_is_tracked_again(
     )
     moved = follow(ball(0.0))
     assert done == tried
-    last = {"soft": iterations(SOFT, FRAMES), "flow": iterations(FLOW, FRAMES) + 7}[
-        tried[0]
-    ]  # none are left after soft
+    second_ends = {"soft": iterations(SOFT, FRAMES), "flow": iterations(FLOW, FRAMES) + 7}  # soft has announced no more
+    last = second_ends[tried[0]]
     assert told == [7, last][: len(tried)] and max(told) <= tracking_iterations(views(azimuths_deg), FRAMES)
     assert moved.surface(1).vertices[:, 0].mean().item() == pytest.approx(errors[kept], abs=1e-5)

@@ -48,6 +48,12 @@ class ControlGraph:
     edges: Int[Tensor, "e 2"]
     lengths: Float[Tensor, " e"]
 
+    @property
+    def spans(self) -> Float[Tensor, "e 3"]:
+        """Vectors along the edges at rest, from the first node to the second one."""
+        ends = self.nodes[self.edges]
+        return ends[:, 1] - ends[:, 0]
+
     def of(self, rows: Int[Tensor, " n"]) -> "ControlGraph":
         """Return the same nodes with the weights of some of the points."""
         return replace(self, indices=self.indices[rows], weights=self.weights[rows])
