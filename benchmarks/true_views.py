@@ -29,7 +29,7 @@ from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
 from steps.fitting.priors import known_views, make_prior, still_views, subject_shapes
-from steps.fitting.tracking import surface_tracker, tracks_surface
+from steps.fitting.tracking import SurfaceTracker, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
 
@@ -102,7 +102,7 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
     video, kind = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), 10), settings.prior
     track = None
     if sides and tracks_surface(settings.motion, kind, sides, len(video)):
-        track = surface_tracker(rest, video, sides, rasterize, generator)
+        track = SurfaceTracker(rest, video, sides, rasterize, generator, settings.motion.trackings)
     prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, track).prior
     deformation = new_deformation(settings.deformation, rest, len(video), generator)
     others = still_views(sides, len(video))

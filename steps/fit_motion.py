@@ -12,7 +12,7 @@ from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.motions import new_deformation, write_motion
 from steps.fitting.priors import make_prior, read_known_views, still_views, subject_hint
 from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_divergence, render_row, show_fit
-from steps.fitting.tracking import TRACKED_NOTE, surface_tracker, tracking_iterations, tracks_surface
+from steps.fitting.tracking import TRACKED_NOTE, SurfaceTracker, most_iterations, tracks_surface
 from steps.runtime.job import Job, StepReport
 
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
@@ -34,9 +34,11 @@ def run(job: Job) -> StepReport:
     cutouts = list(torch.cat([video.frames, video.alpha], -1))
     known = read_known_views(job.inputs.get("known_views"), job.pictures)
     tracked = known if tracks_surface(settings, prior, known, len(video)) else None
-    before = tracking_iterations(tracked, len(video)) if tracked else 0
+    before = most_iterations(tracked, video, settings.trackings) if tracked else 0
     curves = LossCurves(before + settings.iterations, job.progress)
-    track = surface_tracker(gaussians, video, tracked, rasterize, generator, curves.add) if tracked else None
+    track = None
+    if tracked:
+        track = SurfaceTracker(gaussians, video, tracked, rasterize, generator, settings.trackings, curves.add)
     with picture_of_divergence(job, rasterize):
         chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, track)
     deformation = new_deformation(kind, gaussians, len(video), generator)

@@ -76,7 +76,7 @@ def fit_asset_motion(
     for rigidity_loss in _rigidity_losses(settings):
         one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
         fit, before = _Fit(thin, bound, video, rasterize, one, normal), len(found) * iterations(one, len(video))
-        motion = _fitted(fit, video, one, generator, partial(_report_after, report, before))
+        motion = _fitted(fit, video, one, generator, partial(report_after, report, before))
         found.append((fit.difference(motion), motion))
     return min(found, key=lambda one: one[0])[1]
 
@@ -86,7 +86,8 @@ def iterations(settings: AssetSettings, frames: int) -> int:
     return len(_rigidity_losses(settings)) * (settings.track_iterations * frames + settings.joint_iterations)
 
 
-def _report_after(report: Report, before: int, done: int, values: dict[str, float]) -> None:
+def report_after(report: Report, before: int, done: int, values: dict[str, float]) -> None:
+    """Report iterations of a fit that others came before."""
     report(before + done, values)
 
 

@@ -1,6 +1,7 @@
 """Tracking of a subject's surface through its video, from its surface at one frame."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion
+from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion, iterations, report_after
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.inflation.surface import InflatedSurface
@@ -52,6 +53,12 @@ def swinging_is_better(overlap: float, swinging_overlap: float) -> bool:
         swinging_overlap: likewise, in the second try.
     """
     return swinging_overlap > (overlap - WORSE if overlap < LOST else overlap + GAIN)
+
+
+def tracking_iterations(settings: AssetSettings, video: DrivingVideo) -> int:
+    """Return the number of iterations that `track_surface` reports."""
+    orders = tracking_orders(video, 0)
+    return sum(iterations(settings, len(chosen)) for chosen in orders if len(chosen) > 1)
 
 
 def track_surface(
@@ -120,13 +127,13 @@ def track_vertices(
     graph = build_control_graph(points, joined[whole], settings.nodes, settings.tracking == "flow")
     nearest = torch.from_numpy(np.asarray(cKDTree(points).query(gaussians.means.double().numpy())[1]))
     bound = graph.of(torch.from_numpy(index))
-    moved = vertices.repeat(len(video), 1, 1)
+    moved, done = vertices.repeat(len(video), 1, 1), 0
     for chosen in tracking_orders(video, reference_frame):
         if len(chosen) > 1:
             part = DrivingVideo(video.frames[chosen], video.alpha[chosen], video.fps)
-            motion = fit_asset_motion(
-                gaussians, graph.of(nearest), part, rasterize, settings, generator, report, points
-            )
+            told = partial(report_after, report, done)
+            motion = fit_asset_motion(gaussians, graph.of(nearest), part, rasterize, settings, generator, told, points)
+            done += iterations(settings, len(part))
             for number, frame in enumerate(chosen[1:], 1):
                 moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]
     return moved

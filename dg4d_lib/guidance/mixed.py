@@ -1,4 +1,4 @@
-"""Mean of two guesses at the shapes of a subject: where they disagree, views are soft."""
+"""Mean of several guesses at the shapes of a subject: where they disagree, views are soft."""
 
 from collections.abc import Sequence
 
@@ -11,26 +11,24 @@ from dg4d_lib.inflation.surface import InflatedSurface
 
 
 class MixedShapes:
-    """Shapes that are one of two, with known probabilities."""
+    """Shapes that are one of several, with known probabilities."""
 
-    def __init__(self, first: SubjectShapes, second: SubjectShapes, share: float) -> None:
-        """Store both.
+    def __init__(self, guesses: Sequence[SubjectShapes], shares: Sequence[float]) -> None:
+        """Store the guesses.
 
         Args:
-            first: its surfaces stand for both.
-            second: the other shapes of the same frames.
-            share: probability of the second, in [0, 1].
+            guesses: shapes of the same frames; the surfaces of the first stand for all.
+            shares: probability of each, sum 1.
         """
-        self._first, self._share = first, share
-        self.second = second
+        self.guesses, self._shares = tuple(guesses), tuple(shares)
 
     def surface(self, frame: int) -> InflatedSurface:
-        """Return the surface that the first has at a frame.
+        """Return the surface that the first guess has at a frame.
 
         Raises:
             BadInput: there is no such frame.
         """
-        return self._first.surface(frame)
+        return self.guesses[0].surface(frame)
 
     def clean(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
         """Return expected color over white and expected alpha of views of one size, in [0, 1].
@@ -38,5 +36,6 @@ class MixedShapes:
         Raises:
             BadInput: no views, views of different sizes, or a frame that is not there.
         """
-        (color, alpha), (other_color, other_alpha) = self._first.clean(views), self.second.clean(views)
-        return torch.lerp(color, other_color, self._share), torch.lerp(alpha, other_alpha, self._share)
+        weighted = zip(self.guesses, self._shares, strict=True)
+        mean = torch.stack([share * torch.cat(guess.clean(views), -1) for guess, share in weighted]).sum(0)
+        return mean[..., :3], mean[..., 3:]

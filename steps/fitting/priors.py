@@ -67,10 +67,11 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
-CARRIED_SHARE = 0.3  # of the carried shapes in their mean with tracked ones: more is foggy where limbs move
+CARRIED_SHARE = 0.3  # of the carried shapes in their mean with a tracked surface: more is foggy where limbs move
+CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside a surface that is tracked in several ways
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
-Track = Callable[[InflatedSurface], SubjectShapes]  # the surface at all frames, from that of the first
+Track = Callable[[InflatedSurface], Sequence[SubjectShapes]]  # guesses at all frames, from the surface of the first
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        track: moves the surface of known views of the first frame; its shapes are averaged with the other guess.
+        track: moves the surface of known views of the first frame; its guesses are averaged with the carried one.
     """
     others = known_by_frame(sides, len(cutouts))
     known = {frame: [known_view(cutouts[frame]), *views] for frame, views in others.items()}
@@ -202,7 +203,10 @@ def subject_shapes(
         surfaces[0] = colored_surface(volume, known[0])
         first, normal = known_field(known[0], volume, surfaces[0]), mirror_normal(surfaces[0].vertices.double().numpy())
         shapes = _carried_shapes(settings, cutouts, hint, first, normal)
-        shapes = shapes if track is None else MixedShapes(track(surfaces[0]), shapes, CARRIED_SHARE)
+        if track is not None:
+            moved = track(surfaces[0])
+            share = CARRIED_SHARE if len(moved) == 1 else CARRIED_BESIDE_SEVERAL
+            shapes = MixedShapes([*moved, shapes], [*[(1 - share) / len(moved)] * len(moved), share])
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -242,7 +246,7 @@ def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
     """Return the shapes if the shape network predicts them."""
-    shapes = shapes.second if isinstance(shapes, MixedShapes) else shapes
+    shapes = shapes.guesses[-1] if isinstance(shapes, MixedShapes) else shapes
     return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
 
 

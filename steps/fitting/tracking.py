@@ -1,22 +1,33 @@
 """Shapes of later frames from the surface of known views, moved as the video shows it."""
 
+import threading
+from functools import partial
+from itertools import count
+
 import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.asset_motion import Report, iterations
-from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, swinging, swinging_is_better, track_surface
+from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.fitting.surface_tracking import (
+    DESCENT,
+    LOST,
+    swinging,
+    swinging_is_better,
+    track_surface,
+    tracking_iterations,
+)
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.moved import MovedSurfaces
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.kernels.workers import run_parallel, torch_on_one_thread
 from dg4d_lib.metrics.image import iou
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.shape import ALL_AROUND
-from steps.fitting.priors import Track
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
 FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses take twice the time and gain nothing
@@ -24,6 +35,7 @@ SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
 SWING = swinging(SOFT)  # for what loses the outline
+OTHERS = (SWING, FLOW)  # beside SOFT, for what keeps it
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 
 
@@ -45,44 +57,84 @@ def tracking_of(known: Bank) -> AssetSettings:
     return FLOW if len(known.cameras) >= ALL_AROUND else SOFT
 
 
-def tracking_iterations(known: Bank, frames: int) -> int:
-    """Return the largest number of iterations that the tracker reports."""
+def most_iterations(known: Bank, video: DrivingVideo, trackings: int) -> int:
+    """Return the largest number of iterations that a `SurfaceTracker` reports."""
     first = tracking_of(known)
-    return iterations(first, frames) + (iterations(SWING, frames) if first is FLOW else 0)  # others are seldom lost
+    more = (SWING,) if first is FLOW else OTHERS if trackings > 1 else ()  # hulls of few views are seldom lost
+    return sum(tracking_iterations(settings, video) for settings in (first, *more))
 
 
-def surface_tracker(
-    gaussians: Gaussians,
-    video: DrivingVideo,
-    known: Bank,
-    rasterize: Rasterizer,
-    generator: torch.Generator,
-    report: Report = lambda iteration, values: None,
-) -> Track:
-    """Return what moves the surface of known views of the first frame; arguments as of `track_surface`.
+class SurfaceTracker:
+    """Moves the surface of known views of the first frame as the video shows it.
 
     A surface that loses the outline, or that flow follows badly, is tracked a second time, with limbs that swing;
-    `swinging_is_better` chooses between the two motions.
+    `swinging_is_better` chooses between the two motions. One of few views that keeps the outline is also tracked in
+    other ways, whose errors at unseen sides differ.
     """
 
-    def follow(surface: InflatedSurface, settings: AssetSettings, told: Report) -> tuple[float, MovedSurfaces]:
-        moved = MovedSurfaces(track_surface(surface, gaussians, video, rasterize, settings, generator, told))
-        return _overlap(moved, video), moved
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        video: DrivingVideo,
+        known: Bank,
+        rasterize: Rasterizer,
+        generator: torch.Generator,
+        trackings: int,
+        report: Report = lambda iteration, values: None,
+    ) -> None:
+        """Store what all trackings share; other arguments as of `track_surface`.
 
-    def track(surface: InflatedSurface) -> MovedSurfaces:
-        settings = tracking_of(known)
-        overlap, moved = follow(surface, settings, report)
-        if overlap >= (FOLLOWED if settings is FLOW else LOST):
-            return moved
-        done, most = iterations(settings, len(video)), tracking_iterations(known, len(video))
-        second, other = follow(surface, SWING, lambda iteration, values: report(min(done + iteration, most), values))
-        return other if swinging_is_better(overlap, second) else moved
+        Args:
+            known: views of the first frame.
+            trackings: 1, or 3 for the other ways.
+        """
+        self._gaussians, self._video, self._rasterize, self._generator = gaussians, video, rasterize, generator
+        self._first, self._others = tracking_of(known), OTHERS if trackings > 1 else ()
+        self._most, self._report = most_iterations(known, video, trackings), report
+        self._numbers, self._done = count(), [0] * (1 + len(OTHERS))  # iterations of every tracking
+        self._here = threading.get_ident()
 
-    return track
+    def __call__(self, surface: InflatedSurface) -> list[MovedSurfaces]:
+        """Return the surface at all frames, in one way or in each of several ways.
 
+        Raises:
+            FitDiverged: a loss became non-finite.
+        """
+        self._here = threading.get_ident()
+        with torch_on_one_thread():
+            first = self._follow(surface, self._first, self._generator)
+            overlap = self._overlap(first)
+            if overlap < (FOLLOWED if self._first is FLOW else LOST):
+                second = self._follow(surface, SWING, self._generator)
+                return [second if swinging_is_better(overlap, self._overlap(second)) else first]
+            return [first] if self._first is FLOW else [first, *self._followed_by_others(surface)]
 
-def _overlap(moved: MovedSurfaces, video: DrivingVideo) -> float:
-    """Return the intersection over union of silhouettes at the input view, mean over frames."""
-    camera = OrbitCamera(width=video.alpha.shape[2], height=video.alpha.shape[1])
-    _, alpha = moved.clean([GuidanceView(camera, frame) for frame in range(len(video))])
-    return float(iou(alpha, video.alpha.to(alpha)).mean())
+    def _followed_by_others(self, surface: InflatedSurface) -> list[MovedSurfaces]:
+        seeds = torch.randint(2**62, (len(self._others),), generator=self._generator).tolist()
+        found: dict[int, MovedSurfaces] = {}
+
+        def follow(way: int) -> None:
+            found[way] = self._follow(surface, self._others[way], torch.Generator().manual_seed(seeds[way]))
+
+        ways = range(len(self._others))
+        run_parallel([partial(follow, way) for way in ways])
+        return [found[way] for way in ways]
+
+    def _follow(self, surface: InflatedSurface, settings: AssetSettings, generator: torch.Generator) -> MovedSurfaces:
+        number = next(self._numbers)
+
+        def told(iteration: int, values: dict[str, float]) -> None:
+            self._done[number] = iteration
+            if threading.get_ident() == self._here:  # callbacks of a job belong to its thread
+                self._report(min(sum(self._done), self._most), values)
+
+        return MovedSurfaces(
+            track_surface(surface, self._gaussians, self._video, self._rasterize, settings, generator, told)
+        )
+
+    def _overlap(self, moved: MovedSurfaces) -> float:
+        """Return the intersection over union of silhouettes at the input view, mean over frames."""
+        alpha = self._video.alpha
+        camera = OrbitCamera(width=alpha.shape[2], height=alpha.shape[1])
+        _, drawn = moved.clean([GuidanceView(camera, frame) for frame in range(len(self._video))])
+        return float(iou(drawn, alpha.to(drawn)).mean())

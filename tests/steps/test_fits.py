@@ -152,6 +152,7 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
     monkeypatch.setattr(tracking, "SOFT", tracking.SOFT.model_copy(update=small))
+    monkeypatch.setattr(tracking, "OTHERS", tuple(one.model_copy(update=small) for one in tracking.OTHERS))
     settings = revise(SMALL, {"motion.track_surface": True})
     statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
@@ -168,8 +169,8 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
             ["motion", "gaussians", "curves", "picture"],
         )
         assert (TRACKED_NOTE in fit_motion.run(work).notes) == bool(count)
-        fitted = settings.motion.iterations
-        assert json.loads(work.outputs["curves"].read_text())["x"][-1] == fitted + (2 * count + 1 if count else 0)
+        tracked = settings.motion.trackings * (2 * count + 1) if count else 0
+        assert json.loads(work.outputs["curves"].read_text())["x"][-1] == settings.motion.iterations + tracked
 
 
 def test_both_fits_run_with_a_trained_prior_and_say_so(tmp_path: Path, subject: Path):

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import accumulate
 
 import pytest
 import torch
@@ -6,15 +7,18 @@ import trimesh
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.asset_motion import Report, iterations
+from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.fitting.surface_tracking import track_surface, tracking_iterations
+from dg4d_lib.fitting.tracking_order import is_loop
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.kernels import workers
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting import tracking
-from steps.fitting.tracking import FLOW, SOFT, SWING, surface_tracker, tracking_iterations
+from steps.fitting.tracking import FLOW, SOFT, SWING, SurfaceTracker, most_iterations
 
 SIZE, FRAMES = 64, 3
 WAYS = {"soft": SOFT, "flow": FLOW, "swing": SWING}
@@ -42,23 +46,27 @@ ALL_AROUND = list(range(0, 360, 20))
 
 
 @pytest.mark.parametrize(
-    ("azimuths_deg", "first", "second", "tried", "kept"),
+    ("azimuths_deg", "errors", "trackings", "kept"),
     [
-        ([90, 180], 0.0, 0.0, ["soft"], "soft"),
-        ([90, 180], 0.1, 0.1, ["soft", "swing"], "swing"),
-        ([180], 0.1, 0.11, ["soft", "swing"], "swing"),  # lost: a smaller overlap does not tell
-        ([90, 180], 0.1, 0.3, ["soft", "swing"], "soft"),  # far smaller
-        (ALL_AROUND, 0.0, 0.0, ["flow"], "flow"),
-        (ALL_AROUND, 0.03, 0.0, ["flow", "swing"], "swing"),
-        (ALL_AROUND, 0.03, 0.03, ["flow", "swing"], "flow"),  # not lost, and no gain
-        (ALL_AROUND, 0.1, 0.11, ["flow", "swing"], "swing"),
+        ([90, 180], {"soft": 0.0}, 1, ["soft"]),
+        ([90, 180], {"soft": 0.0, "swing": 0.1, "flow": 0.05}, 3, ["soft", "swing", "flow"]),
+        ([90, 180], {"soft": 0.1, "swing": 0.1}, 3, ["swing"]),
+        ([180], {"soft": 0.1, "swing": 0.11}, 1, ["swing"]),  # lost: a smaller overlap does not tell
+        ([90, 180], {"soft": 0.1, "swing": 0.3}, 3, ["soft"]),  # far smaller
+        (ALL_AROUND, {"flow": 0.0}, 3, ["flow"]),
+        (ALL_AROUND, {"flow": 0.03, "swing": 0.0}, 3, ["swing"]),
+        (ALL_AROUND, {"flow": 0.03, "swing": 0.03}, 3, ["flow"]),  # not lost, and no gain
+        (ALL_AROUND, {"flow": 0.1, "swing": 0.11}, 3, ["swing"]),
     ],
 )
-def test_a_surface_that_loses_the_outline_is_tracked_again(
-    monkeypatch: pytest.MonkeyPatch, azimuths_deg: list[float], first: float, second: float, tried: list[str], kept: str
+def test_how_a_surface_is_tracked_depends_on_how_it_keeps_the_outline(
+    monkeypatch: pytest.MonkeyPatch,
+    azimuths_deg: list[float],
+    errors: dict[str, float],
+    trackings: int,
+    kept: list[str],
 ) -> None:
-    errors, done = dict(zip(tried, (first, second), strict=False)), []
-    told: list[int] = []
+    done, told = list[str](), list[int]()
 
     def track(
         surface: InflatedSurface,
@@ -71,24 +79,41 @@ def test_a_surface_that_loses_the_outline_is_tracked_again(
     ) -> list[InflatedSurface]:
         name = next(name for name, one in WAYS.items() if settings == one)
         done.append(name)
-        report(7, {"loss": 1.0})
+        report(tracking_iterations(settings, video), {"loss": 1.0})
         shift = torch.tensor([errors[name], 0, 0])
         return [surface, *(replace(surface, vertices=surface.vertices + shift) for _ in range(FRAMES - 1))]
 
     monkeypatch.setattr(tracking, "track_surface", track)
+    monkeypatch.setattr(workers, "thread_count", lambda: 1)  # one after the other
     points = torch.zeros(1, 3)
     cloud = Gaussians(points, points, torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1), torch.zeros(1, 1, 3))
-    follow = surface_tracker(
+    video, known = video_of([0.0] * FRAMES), views(azimuths_deg)
+    follow = SurfaceTracker(
         cloud,
-        video_of([0.0] * FRAMES),
-        views(azimuths_deg),
+        video,
+        known,
         get_rasterizer("auto"),
         torch.Generator(),
+        trackings,
         lambda iteration, values: told.append(iteration),
     )
-    moved = follow(ball(0.0))
-    assert done == tried
-    second_ends = {"soft": iterations(SOFT, FRAMES), "flow": iterations(FLOW, FRAMES) + 7}  # soft has announced no more
-    last = second_ends[tried[0]]
-    assert told == [7, last][: len(tried)] and max(told) <= tracking_iterations(views(azimuths_deg), FRAMES)
-    assert moved.surface(1).vertices[:, 0].mean().item() == pytest.approx(errors[kept], abs=1e-5)
+    moved = [one.surface(1).vertices[:, 0].mean().item() for one in follow(ball(0.0))]
+    assert done == list(errors)
+    assert moved == pytest.approx([errors[name] for name in kept], abs=1e-5)
+    most = most_iterations(known, video, trackings)
+    ends = accumulate(tracking_iterations(WAYS[name], video) for name in errors)
+    assert told == [min(end, most) for end in ends]
+
+
+def test_trackings_tell_the_iterations_of_both_halves_of_a_loop() -> None:
+    settings = SOFT.model_copy(update={"track_iterations": 2, "joint_iterations": 3, "size": 32, "nodes": 20})
+    surface, video, told = ball(0.0), video_of([0.0, 0.02, 0.02, 0.0]), list[int]()
+    points = surface.vertices[::4]
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(points), 1)
+    harmonics = torch.zeros(len(points), 1, 3)
+    cloud = Gaussians(points, torch.full_like(points, -3), quats, torch.full((len(points),), 4.0), harmonics)
+    generator = torch.Generator().manual_seed(0)
+    report: Report = lambda iteration, values: told.append(iteration)  # noqa: E731
+    track_surface(surface, cloud, video, get_rasterizer("auto"), settings, generator, report)
+    assert is_loop(video)
+    assert told == list(range(1, tracking_iterations(settings, video) + 1))

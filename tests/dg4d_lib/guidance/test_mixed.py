@@ -19,9 +19,10 @@ def shapes(width: int) -> InflatedSurfaces:
 
 
 def test_views_are_the_expected_ones_and_the_surface_is_that_of_the_first() -> None:
-    narrow, wide = shapes(8), shapes(16)
-    mixed = MixedShapes(narrow, wide, 0.25)
-    for both, one, other in zip(mixed.clean(VIEWS), narrow.clean(VIEWS), wide.clean(VIEWS), strict=True):
-        torch.testing.assert_close(both, 0.75 * one + 0.25 * other)
-        assert not torch.allclose(one, other)
+    narrow, wide, wider = (shapes(width) for width in (8, 16, 22))
+    mixed = MixedShapes([narrow, wide, wider], [0.5, 0.3, 0.2])
+    each = (guess.clean(VIEWS) for guess in (mixed, narrow, wide, wider))
+    for mean, one, other, third in zip(*each, strict=True):
+        torch.testing.assert_close(mean, 0.5 * one + 0.3 * other + 0.2 * third)
+        assert not torch.allclose(one, other) and not torch.allclose(other, third)
     assert torch.equal(mixed.surface(0).vertices, narrow.surface(0).vertices)
