@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -67,11 +68,22 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
-CARRIED_SHARE = 0.3  # of the carried shapes in their mean with a tracked surface: more is foggy where limbs move
-CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside a surface that is tracked in several ways
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
-Track = Callable[[InflatedSurface], Sequence[SubjectShapes]]  # guesses at all frames, from the surface of the first
+
+class Tracked(NamedTuple):
+    """Shapes of all frames from the surface of the first one.
+
+    Attributes:
+        guesses: equally probable ones.
+        carried_share: of the shapes that optical flow carries, in their mean with the guesses.
+    """
+
+    guesses: Sequence[SubjectShapes]
+    carried_share: float
+
+
+Track = Callable[[InflatedSurface], Tracked]
 
 
 @dataclass(frozen=True)
@@ -204,8 +216,7 @@ def subject_shapes(
         first, normal = known_field(known[0], volume, surfaces[0]), mirror_normal(surfaces[0].vertices.double().numpy())
         shapes = _carried_shapes(settings, cutouts, hint, first, normal)
         if track is not None:
-            moved = track(surfaces[0])
-            share = CARRIED_SHARE if len(moved) == 1 else CARRIED_BESIDE_SEVERAL
+            moved, share = track(surfaces[0])
             shapes = MixedShapes([*moved, shapes], [*[(1 - share) / len(moved)] * len(moved), share])
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)

@@ -1,6 +1,7 @@
 """Shapes of later frames from the surface of known views, moved as the video shows it."""
 
 import threading
+from collections.abc import Sequence
 from functools import partial
 from itertools import count
 
@@ -28,6 +29,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.shape import ALL_AROUND
+from steps.fitting.priors import Tracked
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
 FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses take twice the time and gain nothing
@@ -36,6 +38,9 @@ SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
 )
 SWING = swinging(SOFT)  # for what loses the outline
 OTHERS = (SWING, FLOW)  # beside SOFT, for what keeps it
+SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (0.3, 1.0))  # beside SWING
+CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
+CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 
 
@@ -60,7 +65,7 @@ def tracking_of(known: Bank) -> AssetSettings:
 def most_iterations(known: Bank, video: DrivingVideo, trackings: int) -> int:
     """Return the largest number of iterations that a `SurfaceTracker` reports."""
     first = tracking_of(known)
-    more = (SWING,) if first is FLOW else OTHERS if trackings > 1 else ()  # hulls of few views are seldom lost
+    more = (SWING,) if first is FLOW else OTHERS if trackings > 1 else ()  # hulls of few pictures are seldom lost
     return sum(tracking_iterations(settings, video) for settings in (first, *more))
 
 
@@ -68,8 +73,8 @@ class SurfaceTracker:
     """Moves the surface of known views of the first frame as the video shows it.
 
     A surface that loses the outline, or that flow follows badly, is tracked a second time, with limbs that swing;
-    `swinging_is_better` chooses between the two motions. One of few views that keeps the outline is also tracked in
-    other ways, whose errors at unseen sides differ.
+    `swinging_is_better` chooses between the two motions. Hulls of few pictures are then tracked in two more ways, whose
+    errors at unseen sides differ: softer and stiffer where limbs swing, else by flow and with limbs that swing.
     """
 
     def __init__(
@@ -89,12 +94,13 @@ class SurfaceTracker:
             trackings: 1, or 3 for the other ways.
         """
         self._gaussians, self._video, self._rasterize, self._generator = gaussians, video, rasterize, generator
-        self._first, self._others = tracking_of(known), OTHERS if trackings > 1 else ()
+        self._first = tracking_of(known)
+        self._several = trackings > 1 and self._first is SOFT
         self._most, self._report = most_iterations(known, video, trackings), report
-        self._numbers, self._done = count(), [0] * (1 + len(OTHERS))  # iterations of every tracking
+        self._numbers, self._done = count(), [0] * (2 + len(OTHERS))  # iterations of every tracking
         self._here = threading.get_ident()
 
-    def __call__(self, surface: InflatedSurface) -> list[MovedSurfaces]:
+    def __call__(self, surface: InflatedSurface) -> Tracked:
         """Return the surface at all frames, in one way or in each of several ways.
 
         Raises:
@@ -102,23 +108,28 @@ class SurfaceTracker:
         """
         self._here = threading.get_ident()
         with torch_on_one_thread():
-            first = self._follow(surface, self._first, self._generator)
-            overlap = self._overlap(first)
+            ways: Sequence[AssetSettings] = OTHERS
+            moved = self._follow(surface, self._first, self._generator)
+            overlap = self._overlap(moved)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
-                return [second if swinging_is_better(overlap, self._overlap(second)) else first]
-            return [first] if self._first is FLOW else [first, *self._followed_by_others(surface)]
+                if not swinging_is_better(overlap, self._overlap(second)):
+                    return Tracked([moved], CARRIED_SHARE)
+                moved, ways = second, SWINGS
+            if not self._several:
+                return Tracked([moved], CARRIED_SHARE)
+            share = CARRIED_SHARE if ways is SWINGS else CARRIED_BESIDE_SEVERAL
+            return Tracked([moved, *self._followed_in(ways, surface)], share)
 
-    def _followed_by_others(self, surface: InflatedSurface) -> list[MovedSurfaces]:
-        seeds = torch.randint(2**62, (len(self._others),), generator=self._generator).tolist()
+    def _followed_in(self, ways: Sequence[AssetSettings], surface: InflatedSurface) -> list[MovedSurfaces]:
+        seeds = torch.randint(2**62, (len(ways),), generator=self._generator).tolist()
         found: dict[int, MovedSurfaces] = {}
 
         def follow(way: int) -> None:
-            found[way] = self._follow(surface, self._others[way], torch.Generator().manual_seed(seeds[way]))
+            found[way] = self._follow(surface, ways[way], torch.Generator().manual_seed(seeds[way]))
 
-        ways = range(len(self._others))
-        run_parallel([partial(follow, way) for way in ways])
-        return [found[way] for way in ways]
+        run_parallel([partial(follow, way) for way in range(len(ways))])
+        return [found[way] for way in range(len(ways))]
 
     def _follow(self, surface: InflatedSurface, settings: AssetSettings, generator: torch.Generator) -> MovedSurfaces:
         number = next(self._numbers)

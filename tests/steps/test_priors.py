@@ -34,6 +34,7 @@ from steps.artifacts.pose import Pose, write_pose
 from steps.fitting import priors
 from steps.fitting.priors import (
     LoadedPrior,
+    Tracked,
     make_oracle_prior,
     make_prior,
     read_bank,
@@ -148,7 +149,13 @@ def test_known_views_of_the_first_frame_guide_all_frames(
     learned = isinstance(settings, LearnedPriorSettings)
     assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
     mixed = make_prior(
-        settings, cutouts, MotionSettings(), None, tmp_path, sides=sides, track=lambda first: MovedSurfaces([first] * 2)
+        settings,
+        cutouts,
+        MotionSettings(),
+        None,
+        tmp_path,
+        sides=sides,
+        track=lambda first: Tracked([MovedSurfaces([first] * 2)], 0.3),
     )
     assert isinstance(mixed.prior, AnalyticPrior) and mixed.prior.weight == 1
     _, between = mixed.prior.clean([GuidanceView(camera, 1)])

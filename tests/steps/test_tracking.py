@@ -18,10 +18,10 @@ from dg4d_lib.kernels import workers
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting import tracking
-from steps.fitting.tracking import FLOW, SOFT, SWING, SurfaceTracker, most_iterations
+from steps.fitting.tracking import FLOW, SOFT, SWING, SWINGS, SurfaceTracker, most_iterations
 
 SIZE, FRAMES = 64, 3
-WAYS = {"soft": SOFT, "flow": FLOW, "swing": SWING}
+WAYS = {"soft": SOFT, "flow": FLOW, "swing": SWING, "softer": SWINGS[0], "stiffer": SWINGS[1]}
 
 
 def ball(x: float) -> InflatedSurface:
@@ -50,7 +50,8 @@ ALL_AROUND = list(range(0, 360, 20))
     [
         ([90, 180], {"soft": 0.0}, 1, ["soft"]),
         ([90, 180], {"soft": 0.0, "swing": 0.1, "flow": 0.05}, 3, ["soft", "swing", "flow"]),
-        ([90, 180], {"soft": 0.1, "swing": 0.1}, 3, ["swing"]),
+        ([90, 180], {"soft": 0.1, "swing": 0.1}, 1, ["swing"]),
+        ([90], {"soft": 0.1, "swing": 0.1, "softer": 0.0, "stiffer": 0.02}, 3, ["swing", "softer", "stiffer"]),
         ([180], {"soft": 0.1, "swing": 0.11}, 1, ["swing"]),  # lost: a smaller overlap does not tell
         ([90, 180], {"soft": 0.1, "swing": 0.3}, 3, ["soft"]),  # far smaller
         (ALL_AROUND, {"flow": 0.0}, 3, ["flow"]),
@@ -97,7 +98,7 @@ def test_how_a_surface_is_tracked_depends_on_how_it_keeps_the_outline(
         trackings,
         lambda iteration, values: told.append(iteration),
     )
-    moved = [one.surface(1).vertices[:, 0].mean().item() for one in follow(ball(0.0))]
+    moved = [one.surface(1).vertices[:, 0].mean().item() for one in follow(ball(0.0)).guesses]
     assert done == list(errors)
     assert moved == pytest.approx([errors[name] for name in kept], abs=1e-5)
     most = most_iterations(known, video, trackings)
