@@ -98,7 +98,7 @@ class SurfaceTracker:
         self._several = trackings > 1 and self._first is SOFT
         self._most, self._report = most_iterations(known, video, trackings), report
         self._numbers, self._done = count(), [0] * (2 + len(OTHERS))  # iterations of every tracking
-        self._here = threading.get_ident()
+        self._here = threading.get_ident()  # callbacks of a job belong to its thread
 
     def __call__(self, surface: InflatedSurface) -> Tracked:
         """Return the surface at all frames, in one way or in each of several ways.
@@ -106,20 +106,18 @@ class SurfaceTracker:
         Raises:
             FitDiverged: a loss became non-finite.
         """
-        self._here = threading.get_ident()
         with torch_on_one_thread():
             ways: Sequence[AssetSettings] = OTHERS
+            share = CARRIED_BESIDE_SEVERAL if self._several else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
                 if not swinging_is_better(overlap, self._overlap(second)):
                     return Tracked([moved], CARRIED_SHARE)
-                moved, ways = second, SWINGS
-            if not self._several:
-                return Tracked([moved], CARRIED_SHARE)
-            share = CARRIED_SHARE if ways is SWINGS else CARRIED_BESIDE_SEVERAL
-            return Tracked([moved, *self._followed_in(ways, surface)], share)
+                moved, ways, share = second, SWINGS, CARRIED_SHARE
+            others = self._followed_in(ways, surface) if self._several else []
+            return Tracked([moved, *others], share)
 
     def _followed_in(self, ways: Sequence[AssetSettings], surface: InflatedSurface) -> list[MovedSurfaces]:
         seeds = torch.randint(2**62, (len(ways),), generator=self._generator).tolist()
@@ -136,7 +134,7 @@ class SurfaceTracker:
 
         def told(iteration: int, values: dict[str, float]) -> None:
             self._done[number] = iteration
-            if threading.get_ident() == self._here:  # callbacks of a job belong to its thread
+            if threading.get_ident() == self._here:
                 self._report(min(sum(self._done), self._most), values)
 
         return MovedSurfaces(

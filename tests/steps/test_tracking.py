@@ -114,7 +114,14 @@ def test_trackings_tell_the_iterations_of_both_halves_of_a_loop() -> None:
     harmonics = torch.zeros(len(points), 1, 3)
     cloud = Gaussians(points, torch.full_like(points, -3), quats, torch.full((len(points),), 4.0), harmonics)
     generator = torch.Generator().manual_seed(0)
-    report: Report = lambda iteration, values: told.append(iteration)  # noqa: E731
-    track_surface(surface, cloud, video, get_rasterizer("auto"), settings, generator, report)
+    track_surface(
+        surface,
+        cloud,
+        video,
+        get_rasterizer("auto"),
+        settings,
+        generator,
+        lambda iteration, values: told.append(iteration),
+    )
     assert is_loop(video)
     assert told == list(range(1, tracking_iterations(settings, video) + 1))
