@@ -420,20 +420,21 @@ class MeshSettings(Settings):
         description="auto: smallest silhouette IoU of the best trial mesh that follows the driving video, else a mesh "
         "per frame",
     )
+    source: Literal["gaussians", "prior"] = Field(
+        "gaussians",
+        description="of a tracked surface: density of the Gaussians, or shape that the learned prior guessed alone",
+    )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
     density_threshold: Positive = Field(0.5, description="level of the isosurface (typical for static assets: 1.0)")
-    edge_length: Positive = Field(
-        0.015, description="target edge length of isotropic remeshing, in units of the normalized box"
+    edge_length: Positive = Field(0.015, description="of isotropic remeshing, in units of the normalized box")
+    fairing: float = Field(
+        0.0, ge=0, le=1, description="world units; bumps of this wavelength lose half of their height"
     )
-    smoothing: int = Field(0, ge=0, le=100, description="pairs of Taubin steps, not on outlines of the input view")
     max_faces: int = Field(100000, ge=100, description="largest number of triangles of a mesh")
-    min_component: Share = Field(
-        0.02, description="connected components with a smaller fraction of the faces are removed"
-    )
+    min_component: Share = Field(0.02, description="components with a smaller fraction of the faces are removed")
     unwrap: UnwrapMethod = Field(
-        "charts",
-        description="charts: even, none mirrored (ours); xatlas: by that library, in half the time, with more islands",
+        "charts", description="charts: even, none mirrored (ours); xatlas: in half the time, with more islands"
     )
     texture_size: int = Field(1024, ge=64, le=8192, description="texels per side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are baked into the texture")

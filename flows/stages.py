@@ -137,6 +137,7 @@ def animate(
     """
     filming = tasks.drive_video.submit(subject, conversion)
     gaussians: Gaussians | Asset
+    known = None
     if job.asset is not None:
         gaussians = model or tasks.prepare_asset(job.asset, conversion, subject)
         driving_video = filming.result()
@@ -149,7 +150,9 @@ def animate(
     if "tracked" in motion.outputs:  # the mesh of the user's model
         mesh = Mesh.model_validate(motion.model_dump())
     else:
-        mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks, fitted=job.asset is None)
+        fitted = job.asset is None
+        guessed = subject if fitted and known is None and job.settings.prior.kind == "learned" else None
+        mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks, fitted, guessed)
     if job.settings.refiner.kind != "identity":
         mesh = tasks.refine_texture(mesh, driving_video, conversion)
     notes = notes_of(done.result for done in tasks.finished())
@@ -173,6 +176,7 @@ def mesh_over_time(
     conversion: Conversion,
     tasks: Tasks,
     fitted: bool,
+    guessed: Subject | None,
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame with the frames divided among the slots.
 
@@ -184,11 +188,12 @@ def mesh_over_time(
         tasks: tasks of the engine.
         fitted: the cloud was fitted to the video too, so that a mesh may follow the video and has its colors; not
             splats of the user's.
+        guessed: subject whose shape the learned prior has guessed from its picture alone.
     """
     guide = driving_video if fitted else None
     plan = tasks.plan_mesh(gaussians, motion, conversion, guide)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return tasks.extract_mesh(gaussians, motion, plan, conversion, guide)
+        return tasks.extract_mesh(gaussians, motion, plan, conversion, guide, subject=guessed)
     frames = count_frames(driving_video.frames, home.store())
     parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
     extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, guide, part) for part in parts]

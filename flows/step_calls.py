@@ -156,10 +156,12 @@ def extract_mesh(
     conversion: Conversion,
     driving_video: DrivingVideo | None = None,
     part: Part | None = None,
+    subject: Subject | None = None,
 ) -> Mesh:
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames.
 
-    Textures take their colors from the driving video, if it is given, where it shows the surface.
+    Textures take their colors from the driving video, if it is given, where it shows the surface. With the subject, the
+    shape of one mesh is what the shape network says of it.
     """
     return run_step("extract_mesh", Mesh, **locals())
 

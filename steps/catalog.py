@@ -191,10 +191,17 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "extract_mesh",
-            inputs={"gaussians": PLY, "motion": MOTION, "plan": PLAN, "driving_video": _optional(FRAMES)},
+            inputs={
+                "gaussians": PLY,
+                "motion": MOTION,
+                "plan": PLAN,
+                "driving_video": _optional(FRAMES),
+                "subject": _optional(PNG),
+                "depth_field": _optional(DEPTH_FIELD),
+            },
             outputs={**EITHER_MESH, "picture": PNG},
             settings="steps.profiles:FrameRange",
-            sections=("rasterizer", "mesh"),
+            sections=("rasterizer", "subject.turn_deg", "mesh"),
         ),
         _step("join_meshes", {"meshes": MESHES.model_copy(update={"many": True})}, {"meshes": MESHES}),
         _step(

@@ -3,9 +3,12 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -17,17 +20,19 @@ from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import color_over_white
+from dg4d_lib.inflation.render import render_surface
+from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
-from dg4d_lib.mesh.extraction.smoothing import smooth_bumps
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
+from dg4d_lib.mesh.fairing import fair
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture
+from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture, drawn_gaussians
 from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
@@ -36,25 +41,45 @@ from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonri
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
-from dg4d_lib.settings import MeshSettings
+from dg4d_lib.settings import LearnedPriorSettings, MeshSettings
+from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
+from steps.fitting.priors import subject_hint, subject_shapes
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
 Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
 Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
+Surface = tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
 SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squared error
 FITTED, FITTED_SELECTIVITY = 32, 1  # frames that the texture is then fitted to, and the exponent of their weights
 LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
+SOURCES = ("isosurface of the Gaussians", "shape network's surface")
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
+
+
+class RestShape(NamedTuple):
+    """Surface that is tracked.
+
+    Attributes:
+        vertices: in the reference frame, world units, not split along seams.
+        faces: counter-clockwise seen from outside.
+        gaussians: in the reference frame.
+        draw: renders what the surface was made of.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    gaussians: Gaussians
+    draw: Draw
 
 
 def run(job: Job) -> StepReport:
@@ -69,23 +94,25 @@ def run(job: Job) -> StepReport:
     frames_of_task: FrameRange = job.settings
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
-    frames = len(states.means)
+    frames, guess = len(states.means), None
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
+        guess = _guessed_shape(job, video, plan.reference_frame)
+        rest = _rest_shape(states.at(plan.reference_frame), plan.level, rasterize, settings, guess)
         if video and plan.guide == "video":
             generator = torch.Generator().manual_seed(job.seed)
-            tracked, ious = _guided(states, video, plan, rasterize, settings, generator)
+            tracked, ious = _guided(rest, states, video, plan, rasterize, settings, generator)
         else:
-            tracked, ious = _tracked(states, displacement, plan, rasterize, settings, video)
+            tracked, ious = _tracked(rest, states, displacement, plan, rasterize, settings, video)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
             f"at rest it is {_check(mesh)}",
-            f"it is the surface of frame {plan.reference_frame}, which follows the {FOLLOWED[plan.guide]} best "
-            f"({plan.followed:.1%} IoU on trial)",
+            f"it is the {SOURCES[guess is not None]} of frame {plan.reference_frame}, which follows the "
+            f"{FOLLOWED[plan.guide]} best ({plan.followed:.1%} IoU on trial)",
             f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]
         if ious.mean() < MIN_IOU:
@@ -102,16 +129,17 @@ def run(job: Job) -> StepReport:
         notes = _soundness(meshes)
         mesh = meshes[first]
     write_png(job.outputs["picture"], _picture(mesh))
-    return StepReport(backend=f"{job.settings.rasterizer} rasterizer, pymeshlab", notes=tuple(notes))
+    weights = packaged.digests() if guess is not None else {}
+    return StepReport(f"{job.settings.rasterizer} rasterizer, pymeshlab", weights, notes=tuple(notes))
 
 
 def textured_mesh(
     gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings, frame: Frame | None = None
 ) -> TexturedMesh:
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
-    vertices, faces = _cleaned_surface(gaussians, level, rasterize, settings)
+    vertices, faces = _isosurface(gaussians, level, rasterize, settings)
     shown = _shown(vertices, faces, frame)
-    mesh, sources = _colored(vertices, faces, gaussians, rasterize, settings, shown)
+    mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
 
 
@@ -126,7 +154,30 @@ def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
     return video
 
 
+def _guessed_shape(job: Job, video: DrivingVideo | None, frame: int) -> InflatedSurface | None:
+    """Return what the shape network says of a frame; None if the mesh comes from the Gaussians."""
+    if job.settings.mesh.source == "gaussians" or video is None or "subject" not in job.inputs:
+        return None
+    prior = LearnedPriorSettings()
+    hint = subject_hint(prior, None, job.inputs.get("depth_field"), job.settings.turn_deg)
+    return subject_shapes(prior, list(torch.cat([video.frames, video.alpha], -1)), hint).surface(frame)
+
+
+def _rest_shape(
+    gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings, guess: InflatedSurface | None
+) -> RestShape:
+    """Return the guess, or without one the isosurface of the Gaussians."""
+    if guess is None:
+        return RestShape(
+            *_isosurface(gaussians, level, rasterize, settings), gaussians, drawn_gaussians(gaussians, rasterize)
+        )
+    unit = density_field(gaussians, settings).unit
+    vertices, faces = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
+    return RestShape(*_faired(vertices, faces, settings), gaussians, partial(render_surface, guess))
+
+
 def _tracked(
+    rest: RestShape,
     states: Gaussians,
     displacement: Displacement,
     plan: MeshPlan,
@@ -136,12 +187,11 @@ def _tracked(
 ) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
     """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
-    rest = states.at(frame)
-    vertices, faces = _cleaned_surface(rest, level, rasterize, settings)
+    vertices, faces = rest.vertices, rest.faces
     with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
         shown = _shown(vertices, faces, _at(video, frame))
-        coloring = beside.submit(_colored, vertices, faces, rest, rasterize, settings, shown)
-        skinned = skin_vertices(vertices, rest, relative_to_frame(displacement, frame))
+        coloring = beside.submit(_colored, vertices, faces, rest.draw, settings, shown)
+        skinned = skin_vertices(vertices, rest.gaussians, relative_to_frame(displacement, frame))
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
@@ -154,6 +204,7 @@ def _tracked(
 
 
 def _guided(
+    rest: RestShape,
     states: Gaussians,
     video: DrivingVideo,
     plan: MeshPlan,
@@ -163,18 +214,17 @@ def _guided(
 ) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
     """Return the mesh that follows the driving video, with colors from it, and the IoU of its outlines."""
     frame, level = plan.reference_frame, plan.level
-    rest = states.at(frame)
-    vertices, faces = _cleaned_surface(rest, level, rasterize, settings)
+    vertices, faces = rest.vertices, rest.faces
     offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
     mesh, sources = _colored(
-        vertices, faces, rest, rasterize, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
+        vertices, faces, rest.draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined = turn_back(vertices, refined, faces, silhouettes)
     moved = vertices + refined
     normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
-    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest, rasterize, settings, footage)
+    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest.draw, settings, footage)
     mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
     tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=frame)
     return tracked, silhouette_iou(moved, faces, silhouettes)
@@ -237,22 +287,22 @@ def _shown(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], frame: Fra
     return split
 
 
-def _cleaned_surface(
-    gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings
-) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+def _isosurface(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> Surface:
     field = density_field(gaussians, settings)
     level = usable_level(field, level)
     field = fill_tunnels(field, level, gaussians, rasterize)
-    vertices, faces = clean(*extract_surface(field, level), settings, field.unit)
-    vertices = unfold(smooth_bumps(vertices, faces, settings.smoothing), faces)
+    return _faired(*clean(*extract_surface(field, level), settings, field.unit), settings)
+
+
+def _faired(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], settings: MeshSettings) -> Surface:
+    vertices = unfold(fair(vertices, faces, settings.fairing), faces)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
 def _colored(
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
-    gaussians: Gaussians,
-    rasterize: Rasterizer,
+    draw: Draw,
     settings: MeshSettings,
     footage: Footage,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
@@ -261,7 +311,7 @@ def _colored(
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
     moments = footage(sources)
-    texture = bake_texture(vertices[sources], normals, corners, uvs, gaussians, rasterize, settings, moments)
+    texture = bake_texture(vertices[sources], normals, corners, uvs, draw, settings, moments)
     return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 

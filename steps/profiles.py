@@ -78,6 +78,7 @@ CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; remove
     },
     **{f"static.{name}": "" for name in ("blob_radius", "radius_jitter", "densify_scale", "reset_opacity_every")},
     "mesh.min_cosine": "",
+    "mesh.smoothing": "mesh.fairing",
     "refiner.steps": "refiner.num_inference_steps",
     "refiner.skipped": "refiner.strength (1 less the old value)",
     "refiner.skipped_start": "refiner.strength_start (1 less the old value)",
@@ -279,7 +280,8 @@ PREVIEW = revise(
         "motion.guided_frames": 6,
         "mesh.mode": "auto",
         "mesh.max_faces": 20000,
-        "mesh.smoothing": 10,
+        "mesh.source": "prior",
+        "mesh.fairing": 0.25,
     },
 )
 

@@ -18,7 +18,8 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.tracking.reference_frame import Trial
 from dg4d_lib.metrics.image import iou
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from dg4d_lib.settings import FramewiseSettings, MeshSettings
+from dg4d_lib.settings import FramewiseSettings, LearnedPriorSettings, MeshSettings
+from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
 from steps import plan_mesh
 from steps.artifacts.media import read_png, write_frames
@@ -26,6 +27,7 @@ from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import write_motion
 from steps.extract_mesh import run
+from steps.fitting.priors import subject_shapes
 from steps.profiles import PREVIEW, step_settings
 from steps.runtime.job import Job, StepReport
 
@@ -74,7 +76,12 @@ def make_plan(
 
 
 def extract(
-    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None, **frames: int
+    folder: Path,
+    gaussians: Gaussians,
+    mesh: MeshSettings = MESH,
+    video: Path | None = None,
+    subject: Path | None = None,
+    **frames: int,
 ) -> tuple[Job, StepReport]:
     """Plan and extract a mesh.
 
@@ -82,7 +89,8 @@ def extract(
     """
     job, planned = make_plan(folder, gaussians, mesh, video)
     settings = step_settings("extract_mesh", PREVIEW.model_copy(update={"mesh": mesh}), **frames)
-    facts = run(replace(job, inputs={**job.inputs, "plan": folder / "plan"}, settings=settings))
+    inputs = {**job.inputs, "plan": folder / "plan"} | ({"subject": subject} if subject else {})
+    facts = run(replace(job, inputs=inputs, settings=settings))
     return job, replace(facts, notes=(*planned.notes, *facts.notes))
 
 
@@ -201,6 +209,22 @@ def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
     assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
     assert shown[covered[..., 0] == 1].mean(0).argmax() == 1  # green, from the video
     assert any("follows the driving video best (90.0% IoU" in note for note in facts.notes)
+
+
+@pytest.mark.parametrize("source", ["prior", "gaussians"])
+def test_a_guessed_subject_has_the_surface_of_the_shape_network(tmp_path: Path, source: str) -> None:
+    alpha = green_video(tmp_path / "video")
+    settings = MESH.model_copy(update={"mode": "tracked", "source": source})
+    _, facts = extract(tmp_path, ball(), settings, tmp_path / "video", subject=tmp_path / "subject.png")
+    guess = LearnedPriorSettings()
+    color = torch.tensor([0.1, 0.9, 0.2]).expand(*alpha.shape[:-1], 3)
+    surface = subject_shapes(guess, list(torch.cat([color, alpha], -1))).surface(0)
+    vertices = read_tracked(tmp_path / "tracked").mesh.vertices
+    apart = float(torch.cdist(vertices, surface.vertices).amin(1).mean())
+    guessed = source == "prior"
+    assert (apart < 0.01) is guessed
+    assert any("it is the shape network's surface of frame 0" in note for note in facts.notes) is guessed
+    assert (facts.weights == packaged.digests()) is guessed
 
 
 @pytest.mark.parametrize("with_video", [True, False])

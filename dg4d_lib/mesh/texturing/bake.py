@@ -1,14 +1,14 @@
 """Texture baking: colors of pictures and Gaussians projected onto a mesh (Tang et al. 2024, section 3.2).
 
-The Gaussians are rendered from 26 views and from the input view, and every texel takes a weighted mean of the colors
-it projects to; views that face it head-on weigh most. Frames of the driving video replace the input view
-where there are some. Colors are un-premultiplied and pixels along soft silhouettes skipped, so no background bleeds
-into the texture.
+The Gaussians, or another guess of the subject, are rendered from 26 views and from the input view; every texel takes a
+weighted mean of the colors it projects to; views that face it head-on weigh most. Frames of the driving video replace
+the input view where there are some. Colors are un-premultiplied and pixels along soft silhouettes skipped, so no
+background bleeds into the texture.
 """
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import no_type_check
@@ -49,6 +49,10 @@ GUTTER = 2  # texels of chart border that are repeated outwards, for bilinear fi
 GUTTER_SHIFTS = sorted(itertools.product(range(-GUTTER, GUTTER + 1), repeat=2), key=lambda shift: math.hypot(*shift))
 VIEWS_AT_ONCE = 9  # bounds memory
 TEXELS_AT_ONCE = 1 << 16  # texels per job of the thread pool
+
+
+Pictures = tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]  # straight color and alpha, in [0, 1]
+Draw = Callable[[Sequence[OrbitCamera]], Pictures]
 
 
 @dataclass(frozen=True)
@@ -92,22 +96,20 @@ def bake_texture(
     normals: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     uvs: Float[Tensor, "v 2"],
-    gaussians: Gaussians,
-    rasterize: Rasterizer,
+    draw: Draw,
     settings: MeshSettings,
     footage: Sequence[PosedSurface] = (),
 ) -> Float[Tensor, "h w 3"]:
-    """Bake the texture of a mesh from the Gaussians it was extracted from, and from footage that it follows.
+    """Bake the texture of a mesh from renders of what it was extracted from, and from footage that it follows.
 
     Args:
         vertices: world units, split along the seams.
         normals: of the unsplit surface (`dg4d_lib.geometry.normals.vertex_normals`), one per split vertex.
         faces: counter-clockwise seen from outside.
         uvs: texture coordinates in [0, 1], v down.
-        gaussians: one state.
-        rasterize: the splatting backend.
+        draw: renders the Gaussians (`drawn_gaussians`), or another guess of the subject.
         settings: mesh settings.
-        footage: the surface at frames of the driving video. They are averaged, and take the place of the Gaussians in
+        footage: the surface at frames of the driving video. They are averaged, and take the place of the renders in
             the input view.
 
     Returns:
@@ -131,7 +133,8 @@ def bake_texture(
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
-        renders = _render_views(batch, vertices, faces, gaussians, rasterize)
+        color, alpha = draw(batch)
+        renders = grade_pixels(color, alpha[..., 0], batch, vertices, faces, OUTLINE)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0 and not footage:
             rules[0] = flattest, INPUT_WEIGHT
@@ -203,23 +206,15 @@ def _add(
         _gather(positions, normals, *pose, *images, *rule, total[part])
 
 
-def _render_views(
-    cameras: Sequence[OrbitCamera],
-    vertices: Float[Tensor, "v 3"],
-    faces: Int[Tensor, "f 3"],
-    gaussians: Gaussians,
-    rasterize: Rasterizer,
-) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Render the Gaussians and the mesh.
+def drawn_gaussians(gaussians: Gaussians, rasterize: Rasterizer) -> Draw:
+    """Return a function that renders one state of a cloud."""
 
-    Returns:
-        Straight color; grade (0: background, 1: along the silhouette, 2: inside); camera z of the mesh; and the minimum
-        of z around every pixel. The z of background is infinite.
-    """
-    with torch.no_grad():
-        render = rasterize(gaussians, cameras, torch.zeros(3))
-    color = (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1)
-    return grade_pixels(color, render.alpha[..., 0], cameras, vertices, faces, OUTLINE)
+    def draw(cameras: Sequence[OrbitCamera]) -> Pictures:
+        with torch.no_grad():
+            render = rasterize(gaussians, cameras, torch.zeros(3))
+        return (render.color / render.alpha.clamp_min(1e-6)).clamp(0, 1), render.alpha
+
+    return draw
 
 
 def grade_pixels(

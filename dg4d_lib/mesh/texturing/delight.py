@@ -15,10 +15,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from dg4d_lib.geometry.normals import vertex_normals
-from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
+from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.unwrap import SMOOTHING
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (Rec. 709)

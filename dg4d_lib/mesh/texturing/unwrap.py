@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.chart_packing import pack_charts
 from dg4d_lib.mesh.texturing.charts import find_charts
+from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.xatlas_charts import unwrap_with_xatlas
 from dg4d_lib.settings import UnwrapMethod
 

@@ -6,7 +6,6 @@ nearest point where the density of the frame falls below the level, if there is 
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 from torch import Tensor
@@ -14,13 +13,13 @@ from torch import Tensor
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
+from dg4d_lib.mesh.fairing import bump_filter
 from dg4d_lib.settings import MeshSettings
 
 LEVEL_FACTOR = 1.4  # factor of the level; a mesh that joins separating limbs is too thick over the whole motion
 REACH = 3.0  # longest step of a vertex, in cells of the density field
 STEPS = 13  # samples along the normal, from inside to outside
 PASSES = 3  # projections, each starting from the previous result
-SMOOTHING = 3  # averaging rounds of the steps over neighboring vertices
 
 
 def project_to_isosurface(
@@ -41,17 +40,14 @@ def project_to_isosurface(
         level: density of the surface in the reference frame; vertices are projected to 1.4 times this level.
         settings: mesh settings.
     """
-    mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
-    mean_of_neighbors = trimesh.smoothing.laplacian_calculation(mesh)
+    smooth = bump_filter(vertices.numpy(), faces.numpy(), settings.fairing)
     corrected = offsets.clone()
     for frame in range(len(offsets)):
         field = density_field(states.at(frame), settings)
         for _ in range(PASSES):
             moved = vertices + corrected[frame]
             normals = vertex_normals(moved, faces)
-            distances = steps_to_isosurface(field, moved.numpy(), normals.numpy(), LEVEL_FACTOR * level)
-            for _ in range(SMOOTHING):
-                distances = 0.5 * distances + 0.5 * (mean_of_neighbors @ distances)
+            distances = smooth(steps_to_isosurface(field, moved.numpy(), normals.numpy(), LEVEL_FACTOR * level))
             corrected[frame] += torch.from_numpy(distances.astype(np.float32))[:, None] * normals
     return corrected
 

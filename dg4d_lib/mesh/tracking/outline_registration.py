@@ -27,9 +27,9 @@ from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh.extraction.unfold import unfold
-from dg4d_lib.mesh.neighbors import neighbor_means
+from dg4d_lib.mesh.fairing import LowPass, bump_filter
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
-from dg4d_lib.mesh.tracking.isosurface_projection import SMOOTHING, steps_to_isosurface
+from dg4d_lib.mesh.tracking.isosurface_projection import steps_to_isosurface
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -110,13 +110,14 @@ def register_to_outlines(
             drawn = [rasterize(states.at(frame), [camera], black).alpha[0, ..., 0] for frame in range(len(offsets))]
         masks.append(torch.stack(drawn) > ALPHA_THRESHOLD)
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
+    smooth = bump_filter(body.rest, body.faces, settings.fairing)
     registered, overlaps = offsets.clone(), [-1.0] * len(offsets)
 
     def improve(frame: int, start: Float[Tensor, "v 3"]) -> bool:
         """Register a frame from a start; return True if its silhouette agrees better with the video's than before."""
         targets = [outline_of(mask[frame].numpy(force=True)).points for mask in masks]
         field = density_field(states.at(frame), settings)
-        moved = _registered(body, vertices + start, faces, targets, cameras, field, level, rounds).to(offsets)
+        moved = _registered(body, vertices + start, faces, targets, cameras, field, level, rounds, smooth).to(offsets)
         overlap = _overlap(moved, faces, cameras[0], masks[0][frame])
         better = overlap > overlaps[frame] + GAIN
         if better:
@@ -198,17 +199,15 @@ def _registered(
     field: DensityField,
     level: float,
     rounds: Sequence[tuple[int, int]],
+    smooth: LowPass,
 ) -> Float[Tensor, "v 3"]:
     """Return the registered vertices of one frame."""
-    mean_of_neighbors = neighbor_means(body.edges)
     moved = start.double().numpy()
     for first, then in rounds:
         for number in range(first + then):
             shown = torch.from_numpy(moved).float()
             normals = vertex_normals(shown, faces).numpy()
-            distances = steps_to_isosurface(field, shown.numpy(), normals, level)
-            for _ in range(SMOOTHING):
-                distances = 0.5 * distances + 0.5 * (mean_of_neighbors @ distances)
+            distances = smooth(steps_to_isosurface(field, shown.numpy(), normals, level))
             steps: NDArray[np.float64] = distances[:, None] * normals.astype(np.float64)
             pull = np.full(len(moved), PULL)
             if number >= first:

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.extraction.smoothing import taubin_smooth
+from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.unwrap import SMOOTHING, unwrap
 
 Mesh = tuple[np.ndarray, np.ndarray]
