@@ -120,6 +120,16 @@ def test_a_mesh_per_frame_is_divided_and_joined(alone: Path, tmp_path: Path, mon
     assert (tmp_path / "one" / "asset.glb").read_bytes() == (tmp_path / "out" / "asset.glb").read_bytes()
 
 
+@pytest.mark.parametrize(("kind", "guessed"), [("learned", True), ("geometric", False)])
+def test_one_mesh_has_the_shape_that_the_learned_prior_guessed(
+    alone: Path, tmp_path: Path, kind: str, guessed: bool
+) -> None:
+    convert_inline(job("shape", tmp_path, **{"mesh.mode": "tracked", "prior.kind": kind}), tmp_path / "out")
+    steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
+    inputs = {step["step"]: step["inputs"] for step in steps}
+    assert ("subject" in inputs["extract_mesh"]) is guessed
+
+
 @pytest.mark.parametrize(("words", "runs"), [("memory", 3), ("crash", 2), ("bad:no", 1), ("memory-once", 2)])
 def test_steps_are_retried_as_often_as_by_prefect(alone: Path, tmp_path: Path, words: str, runs: int) -> None:
     events: list[StepEvent] = []

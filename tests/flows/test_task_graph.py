@@ -47,6 +47,7 @@ def test_views_of_other_sides_reach_both_fits_and_belong_to_the_package(log: Pat
     steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
     inputs = {step["step"]: step["inputs"] for step in steps}
     assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]
+    assert all("subject" not in given for step, given in inputs.items() if step.startswith("extract_mesh"))
 
 
 @pytest.mark.parametrize("given", [False, True])
@@ -63,6 +64,7 @@ def test_drawn_views_reach_both_fits_and_give_way_to_the_users(given: bool, log:
     steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
     inputs = {step["step"]: step["inputs"] for step in steps}
     assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]
+    assert all("subject" not in given for step, given in inputs.items() if step.startswith("extract_mesh"))
 
 
 def test_the_run_graph_has_every_edge(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
