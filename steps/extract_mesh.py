@@ -61,7 +61,6 @@ SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squar
 FITTED, FITTED_SELECTIVITY = 32, 1  # frames that the texture is then fitted to, and the exponent of their weights
 LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
-SOURCES = ("isosurface of the Gaussians", "shape network's surface")
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
 
@@ -108,10 +107,11 @@ def run(job: Job) -> StepReport:
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
+        kind = "isosurface of the Gaussians" if guess is None else "shape network's surface"
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
             f"at rest it is {_check(mesh)}",
-            f"it is the {SOURCES[guess is not None]} of frame {plan.reference_frame}, which follows the "
+            f"it is the {kind} of frame {plan.reference_frame}, which follows the "
             f"{FOLLOWED[plan.guide]} best ({plan.followed:.1%} IoU on trial)",
             f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]

@@ -148,7 +148,7 @@ def select_guided_reference(
     compared = evenly_spaced(len(video), TRIAL_FRAMES)
     alpha = video.alpha[compared][..., 0]
     silhouettes = render_silhouettes(states, compared, rasterize, alpha)
-    coarse = settings.model_copy(update={"grid": min(TRIAL_GRID, settings.grid)})
+    coarse = settings.model_copy(update={"grid": min(TRIAL_GRID, settings.grid), "fairing": 0.0})
     scores = {}
     for frame in dict.fromkeys([0, given, *frames_with_long_outlines(video, CANDIDATES)]):
         rest = states.at(frame)

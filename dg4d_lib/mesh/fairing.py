@@ -125,9 +125,8 @@ def thickness(
         most: largest thickness that is told apart, world units.
     """
     normals = vertex_normals(torch.from_numpy(vertices).float(), torch.from_numpy(faces)).double().numpy()
-    sides = (np.concatenate([vertices, sign * most * normals], 1) for sign in (1, -1))
-    tree, across = cKDTree(next(sides)), next(sides)
-    nearest = tree.query(across)[1]
+    tree = cKDTree(np.concatenate([vertices, most * normals], 1))
+    nearest = tree.query(np.concatenate([vertices, -most * normals], 1))[1]
     ways = vertices[nearest] - vertices
     distances = np.linalg.norm(ways, axis=1).astype(np.float64)
     opposite = np.einsum("vi,vi->v", normals, normals[nearest]) <= OPPOSITE
@@ -140,11 +139,14 @@ def _strength(
 ) -> Float64[np.ndarray, " v"]:
     """Return strengths for a wavelength, shorter on thin parts.
 
-    How thick parts are is measured without the bumps, which are thin parts themselves.
+    Thickness is measured without the bumps, which are thin parts themselves.
     """
-    even = LowPass(edges, strength_of(np.full(len(vertices), wavelength), vertices, faces))
+    alike = strength_of(np.full(len(vertices), float(wavelength)), vertices, faces)
+    if wavelength == 0:
+        return alike
+    even = LowPass(edges, alike)
     smooth = np.stack([even(column) for column in vertices.T], 1)
-    waves = np.minimum(THICKNESSES * thickness(smooth, faces, max(wavelength, 1e-6) / THICKNESSES), wavelength)
+    waves = THICKNESSES * thickness(smooth, faces, wavelength / THICKNESSES)
     mean_of_neighbors = neighbor_means(edges)
     for _ in range(ROUNDS):
         waves = (waves + mean_of_neighbors @ waves) / 2
