@@ -42,8 +42,8 @@ the lit mesh and the splats while the camera sways by 35 degrees to both sides. 
 and the motion is one of the six loops that need no model.
 
 `make gallery` draws the inputs (`examples/gallery`), converts them and writes this page. Times are those of the
-conversions shown, on two cores with some work beside: about a minute where the mesh follows the motion of the splats, twice
-that where it follows the video. The pictures are Apache-2.0, as the rest of the project.
+conversions shown, on two cores with some work beside: about a minute where the mesh follows the motion of the splats,
+twice that where it follows the video. The pictures are Apache-2.0, as the rest of the project.
 """
 
 
