@@ -156,7 +156,8 @@ def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
 
 def _guessed_shape(job: Job, video: DrivingVideo | None, frame: int) -> InflatedSurface | None:
     """Return what the shape network says of a frame; None if the mesh comes from the Gaussians."""
-    if job.settings.mesh.source == "gaussians" or video is None or "subject" not in job.inputs:
+    settings: MeshSettings = job.settings.mesh
+    if settings.source == "gaussians" or video is None or "subject" not in job.inputs:
         return None
     prior = LearnedPriorSettings()
     hint = subject_hint(prior, None, job.inputs.get("depth_field"), job.settings.turn_deg)
