@@ -422,7 +422,7 @@ class MeshSettings(Settings):
     )
     source: Literal["gaussians", "prior"] = Field(
         "gaussians",
-        description="of a tracked surface: density of the Gaussians, or shape that the learned prior guessed alone",
+        description="of one mesh: density of the Gaussians, or the guess of the learned prior without known views",
     )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")

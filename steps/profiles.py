@@ -78,7 +78,7 @@ CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; remove
     },
     **{f"static.{name}": "" for name in ("blob_radius", "radius_jitter", "densify_scale", "reset_opacity_every")},
     "mesh.min_cosine": "",
-    "mesh.smoothing": "mesh.fairing",
+    "mesh.smoothing": "mesh.fairing (a wavelength in world units, 0.25 in preview)",
     "refiner.steps": "refiner.num_inference_steps",
     "refiner.skipped": "refiner.strength (1 less the old value)",
     "refiner.skipped_start": "refiner.strength_start (1 less the old value)",
