@@ -102,11 +102,11 @@ class LearnedPriorSettings(Settings):
         0.5, ge=0, le=10, description="factor on the guidance loss; a smaller one leaves the input view sharper"
     )
     depth_sigma: float = Field(
-        0.03,
+        0.0,
         ge=0,
         le=0.5,
-        description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
-        " soft along the direction in which depth shows",
+        description="0: views show a sharp surface; else views from the side are averaged over this standard deviation "
+        "of its depth, world units: closer to the truth on average, but soft (typical: 0.03)",
     )
     contrast: float = Field(
         0.0,

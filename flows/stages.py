@@ -191,7 +191,7 @@ def mesh_over_time(
         guessed: subject whose shape the learned prior has guessed from its picture alone.
     """
     guide = driving_video if fitted else None
-    plan = tasks.plan_mesh(gaussians, motion, conversion, guide)
+    plan = tasks.plan_mesh(gaussians, motion, conversion, guide, subject=guessed)
     if read_plan(home.store().path(plan.plan)).mode == "tracked":
         return tasks.extract_mesh(gaussians, motion, plan, conversion, guide, subject=guessed)
     frames = count_frames(driving_video.frames, home.store())

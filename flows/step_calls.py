@@ -143,9 +143,16 @@ def fit_motion(
 
 
 def plan_mesh(
-    gaussians: Gaussians | Asset, motion: Motion, conversion: Conversion, driving_video: DrivingVideo | None = None
+    gaussians: Gaussians | Asset,
+    motion: Motion,
+    conversion: Conversion,
+    driving_video: DrivingVideo | None = None,
+    subject: Subject | None = None,
 ) -> Plan:
-    """Decide whether one mesh can follow the motion or every frame needs its own."""
+    """Decide whether one mesh can follow the motion or every frame needs its own.
+
+    With the subject, the shape of one mesh will be what the shape network says of it.
+    """
     return run_step("plan_mesh", Plan, **locals())
 
 

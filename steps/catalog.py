@@ -185,9 +185,15 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "plan_mesh",
-            inputs={"gaussians": PLY, "motion": MOTION, "driving_video": _optional(FRAMES)},
+            inputs={
+                "gaussians": PLY,
+                "motion": MOTION,
+                "driving_video": _optional(FRAMES),
+                "subject": _optional(PNG),
+                "depth_field": _optional(DEPTH_FIELD),
+            },
             outputs={"plan": PLAN},
-            sections=("rasterizer", "mesh"),
+            sections=("rasterizer", "subject.turn_deg", "mesh"),
         ),
         _step(
             "extract_mesh",

@@ -41,14 +41,14 @@ from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonri
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
-from dg4d_lib.settings import LearnedPriorSettings, MeshSettings
+from dg4d_lib.settings import MeshSettings
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
-from steps.fitting.priors import subject_hint, subject_shapes
+from steps.fitting.guesses import guessed_shapes
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
@@ -97,7 +97,8 @@ def run(job: Job) -> StepReport:
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        guess = _guessed_shape(job, video, plan.reference_frame)
+        shapes = guessed_shapes(job, video)
+        guess = shapes.surface(plan.reference_frame) if shapes else None
         rest = _rest_shape(states.at(plan.reference_frame), plan.level, rasterize, settings, guess)
         if video and plan.guide == "video":
             generator = torch.Generator().manual_seed(job.seed)
@@ -152,16 +153,6 @@ def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
     if len(video) != frames:
         raise BadInput(f"the driving video has {len(video)} frames and the motion {frames}; fit the motion again")
     return video
-
-
-def _guessed_shape(job: Job, video: DrivingVideo | None, frame: int) -> InflatedSurface | None:
-    """Return what the shape network says of a frame; None if the mesh comes from the Gaussians."""
-    settings: MeshSettings = job.settings.mesh
-    if settings.source == "gaussians" or video is None or "subject" not in job.inputs:
-        return None
-    prior = LearnedPriorSettings()
-    hint = subject_hint(prior, None, job.inputs.get("depth_field"), job.settings.turn_deg)
-    return subject_shapes(prior, list(torch.cat([video.frames, video.alpha], -1)), hint).surface(frame)
 
 
 def _rest_shape(

@@ -97,5 +97,5 @@ def initial_gaussians(
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
     count = start.points or (PREDICTED_POINTS if isinstance(shapes, LearnedShapes) else INFLATED_POINTS)
-    points, _, colors, area = sample_surface(shapes.surface(0), count, generator)
-    return on_surface(points, colors, area)
+    points, normals, colors, area = sample_surface(shapes.surface(0), count, generator)
+    return on_surface(points, normals, colors, area)

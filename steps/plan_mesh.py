@@ -13,6 +13,7 @@ from dg4d_lib.settings import MeshSettings
 from steps.artifacts.media import read_frames
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_states
+from steps.fitting.guesses import guessed_shapes
 from steps.runtime.job import Job, StepReport
 
 FINER, FINEST = 1.5, 512  # factor of `mesh.grid` that a mesh per frame tries, and the largest grid
@@ -40,7 +41,8 @@ def run(job: Job) -> StepReport:
         if torn and "driving_video" in job.inputs:
             video = read_frames(job.inputs["driving_video"], job.pictures)
             generator = torch.Generator().manual_seed(job.seed)
-            guided = select_guided_reference(states, video, rasterize, settings, frame, generator)
+            shapes = guessed_shapes(job, video)
+            guided = select_guided_reference(states, video, rasterize, settings, frame, generator, shapes)
             if mode == "tracked" or guided[1] >= settings.min_guided or followed < settings.min_followed:
                 (frame, followed), guide = guided, "video"
     if mode == "auto":

@@ -13,9 +13,11 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, swinging, swinging_is_better, track_vertices
 from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.folds import genus
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.color_registration import register_to_colors
 from dg4d_lib.mesh.tracking.outline_registration import LAST_ROUNDS, register_to_outlines
@@ -32,6 +34,7 @@ TRIAL_ROUNDS = ((2, 4),)  # passes of the registration to outlines in a trial
 TRIAL_FRAMES = 6  # at which silhouettes are compared
 TRIAL_GRID = 48  # cells per axis of the density field
 CANDIDATES = 3  # candidate frames with long outlines, besides the given ones
+HANDLE_COST = 0.01  # of the trial's IoU by which another frame may be worse for each handle that it has less
 APART = 1 / 10  # smallest distance of two candidates, share of the frames
 
 
@@ -128,8 +131,11 @@ def select_guided_reference(
     settings: MeshSettings,
     given: int,
     generator: torch.Generator,
+    shapes: SubjectShapes | None = None,
 ) -> tuple[int, float]:
     """Select the frame whose surface follows the driving video best, by trials on a coarse grid.
+
+    A frame yields to another one whose surface has fewer handles, where limbs that touch have grown together.
 
     Args:
         states: the cloud at every frame (fields "t n 3").
@@ -138,6 +144,7 @@ def select_guided_reference(
         settings: mesh settings.
         given: a frame that is tried too, besides the first one and those with the longest outlines.
         generator: draws the frames of joint iterations.
+        shapes: surfaces that the mesh will have, whose handles count; None: the handles are not known.
 
     Returns:
         The frame, and the mean intersection over union of silhouettes over frames and views, in [0, 1].
@@ -161,7 +168,8 @@ def select_guided_reference(
             vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse, TRIAL_ROUNDS
         )
         scores[frame] = float(silhouette_iou(vertices + offsets, faces, silhouettes).mean())
-    best = max(scores, key=lambda frame: scores[frame])
+    handles = {frame: genus(shapes.surface(frame).faces.numpy()) if shapes else 0 for frame in scores}
+    best = max(scores, key=lambda frame: scores[frame] - HANDLE_COST * handles[frame])
     return best, scores[best]
 
 

@@ -127,7 +127,7 @@ def test_one_mesh_has_the_shape_that_the_learned_prior_guessed(
     convert_inline(job("shape", tmp_path, **{"mesh.mode": "tracked", "prior.kind": kind}), tmp_path / "out")
     steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
     inputs = {step["step"]: step["inputs"] for step in steps}
-    assert ("subject" in inputs["extract_mesh"]) is guessed
+    assert ("subject" in inputs["plan_mesh"]) is ("subject" in inputs["extract_mesh"]) is guessed
 
 
 @pytest.mark.parametrize(("words", "runs"), [("memory", 3), ("crash", 2), ("bad:no", 1), ("memory-once", 2)])
