@@ -13,7 +13,6 @@ from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 BLOB_OPACITY = 0.1  # initial opacity (DreamGaussian)
 SURFACE_OPACITY = 0.9  # ours: the surface is known
-SURFACE_FLATNESS = 0.6  # ours: flatter ones leave the inside hollow, and the isosurface gets holes
 NEIGHBORS = 3  # whose distances give the scale (3DGS)
 MIN_SCALE = 1e-4  # world units, for coincident points
 
@@ -35,18 +34,23 @@ def blob(count: int, radius: float, generator: torch.Generator) -> Gaussians:
 
 
 def on_surface(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], area: float
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
+    area: float,
+    flatness: float = 1.0,
 ) -> Gaussians:
-    """Return flat Gaussians on a surface, of scale sqrt(area / n) across the normals and opacity 0.9.
+    """Return Gaussians on a surface, of scale sqrt(area / n) across the normals and opacity 0.9.
 
     Args:
         points: uniform samples of the surface, world units.
         normals: unit normals at the points.
         colors: at the points, in [0, 1].
         area: of the surface, world units squared.
+        flatness: standard deviation along the normals, times that across them.
     """
     scale = max(math.sqrt(area / len(points)), MIN_SCALE)
-    return discs(points, normals, scale, SURFACE_FLATNESS, colors, SURFACE_OPACITY)
+    return discs(points, normals, scale, flatness, colors, SURFACE_OPACITY)
 
 
 def discs(

@@ -3,7 +3,7 @@ import math
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.gaussians.initialize import SURFACE_FLATNESS, blob, on_surface
+from dg4d_lib.gaussians.initialize import blob, on_surface
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import get_rasterizer
 
@@ -28,18 +28,18 @@ def sphere(count: int) -> torch.Tensor:
 
 def test_gaussians_on_a_surface_are_flat_along_its_normals():
     points = sphere(100)
-    cloud = on_surface(points, points, points.abs(), area=4.0)
+    cloud = on_surface(points, points, points.abs(), area=4.0, flatness=0.5)
     normals = quat_to_rotmat(cloud.quats)[..., 2]
     torch.testing.assert_close(normals, points, atol=1e-5, rtol=0)
     torch.testing.assert_close(cloud.scales[:, :2], torch.full((100, 2), 0.2))
-    torch.testing.assert_close(cloud.scales[:, 2], torch.full((100,), SURFACE_FLATNESS * 0.2))
+    torch.testing.assert_close(cloud.scales[:, 2], torch.full((100,), 0.1))
     torch.testing.assert_close(cloud.colors, points.abs())
     torch.testing.assert_close(cloud.means, points)
 
 
 def test_gaussians_on_a_sphere_hide_its_inside_and_keep_its_outline():
     points = 0.5 * sphere(2000)
-    cloud = on_surface(points, 2 * points, torch.zeros(2000, 3), area=math.pi)
+    cloud = on_surface(points, 2 * points, torch.zeros(2000, 3), area=math.pi, flatness=0.5)
     camera = OrbitCamera(width=128, height=128)
     alpha = get_rasterizer("auto")(cloud, [camera], torch.ones(3)).alpha[0, ..., 0]
     places = torch.arange(128) + 0.5 - 64
