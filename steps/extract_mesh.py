@@ -97,8 +97,9 @@ def run(job: Job) -> StepReport:
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
-        shapes = guessed_shapes(job, video)
-        guess = shapes.surface(plan.reference_frame) if shapes else None
+        if settings.source == "prior" and video and "subject" in job.inputs:
+            shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
+            guess = shapes.surface(plan.reference_frame)
         rest = _rest_shape(states.at(plan.reference_frame), plan.level, rasterize, settings, guess)
         if video and plan.guide == "video":
             generator = torch.Generator().manual_seed(job.seed)

@@ -10,6 +10,7 @@ from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
+from dg4d_lib.shape_prior import packaged
 from steps.artifacts.media import read_frames
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
 from steps.artifacts.motions import read_states
@@ -34,6 +35,7 @@ def run(job: Job) -> StepReport:
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
     guide: Literal["gaussians", "video"] = "gaussians"
+    shapes = None
     if mode != "per_frame":
         trial = select_reference_frame(states, displacement, rasterize, settings)
         frame, followed = trial.frame, trial.iou
@@ -41,7 +43,8 @@ def run(job: Job) -> StepReport:
         if torn and "driving_video" in job.inputs:
             video = read_frames(job.inputs["driving_video"], job.pictures)
             generator = torch.Generator().manual_seed(job.seed)
-            shapes = guessed_shapes(job, video)
+            if settings.source == "prior" and "subject" in job.inputs:
+                shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
             guided = select_guided_reference(states, video, rasterize, settings, frame, generator, shapes)
             if mode == "tracked" or guided[1] >= settings.min_guided or followed < settings.min_followed:
                 (frame, followed), guide = guided, "video"
@@ -69,4 +72,5 @@ def run(job: Job) -> StepReport:
     plan = MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level, grid=grid, guide=guide)
     write_plan(job.outputs["plan"], plan)
     job.progress(2, 2, {})
-    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+    weights = packaged.digests() if shapes else {}
+    return StepReport(f"{job.settings.rasterizer} rasterizer", weights, notes=tuple(notes))
