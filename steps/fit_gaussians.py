@@ -28,7 +28,6 @@ from steps.fitting.reporting import LossCurves, picture_of_divergence, render_tu
 from steps.runtime.job import Job, StepReport
 
 BLOB_RADIUS = 0.5  # world units
-PREDICTED_FLATNESS = 0.6  # flatter ones leave the inside hollow, and the isosurface gets holes
 INFLATED_POINTS, PREDICTED_POINTS = 5000, 8000  # the input view of a predicted surface gains 1 dB from 3,000 more
 
 
@@ -97,7 +96,6 @@ def initial_gaussians(
     """Initialize Gaussians as a random blob, or as points on the surface of the first frame."""
     if isinstance(start, BlobStartSettings):
         return blob(start.points, BLOB_RADIUS, generator)
-    predicted = isinstance(shapes, LearnedShapes)
-    count = start.points or (PREDICTED_POINTS if predicted else INFLATED_POINTS)
-    points, normals, colors, area = sample_surface(shapes.surface(0), count, generator)
-    return on_surface(points, normals, colors, area, PREDICTED_FLATNESS if predicted else 1.0)
+    count = start.points or (PREDICTED_POINTS if isinstance(shapes, LearnedShapes) else INFLATED_POINTS)
+    points, _, colors, area = sample_surface(shapes.surface(0), count, generator)
+    return on_surface(points, colors, area)

@@ -1,4 +1,4 @@
-"""Initialization of clouds: random ball (DreamGaussian), or discs on a surface."""
+"""Initialization of clouds: random ball (DreamGaussian), or points on a surface."""
 
 import math
 
@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import turn_z_to
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 
 BLOB_OPACITY = 0.1  # initial opacity (DreamGaussian)
@@ -33,52 +32,16 @@ def blob(count: int, radius: float, generator: torch.Generator) -> Gaussians:
     return isotropic(means, scales, torch.full((count, 3), 0.5), BLOB_OPACITY)
 
 
-def on_surface(
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    colors: Float[Tensor, "n 3"],
-    area: float,
-    flatness: float = 1.0,
-) -> Gaussians:
-    """Return Gaussians on a surface, of scale sqrt(area / n) across the normals and opacity 0.9.
+def on_surface(points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], area: float) -> Gaussians:
+    """Return isotropic Gaussians on a surface, of scale sqrt(area / n) and opacity 0.9.
 
     Args:
         points: uniform samples of the surface, world units.
-        normals: unit normals at the points.
         colors: at the points, in [0, 1].
         area: of the surface, world units squared.
-        flatness: standard deviation along the normals, times that across them.
     """
     scale = max(math.sqrt(area / len(points)), MIN_SCALE)
-    return discs(points, normals, scale, flatness, colors, SURFACE_OPACITY)
-
-
-def discs(
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    scale: float,
-    flatness: float,
-    colors: Float[Tensor, "n 3"],
-    opacity: float,
-) -> Gaussians:
-    """Return Gaussians that are flat along unit normals.
-
-    Args:
-        points: centers, world units.
-        normals: unit normals.
-        scale: standard deviation across the normals, world units.
-        flatness: standard deviation along the normals, times `scale`.
-        colors: in [0, 1].
-        opacity: at the centers.
-    """
-    log_scales = points.new_tensor((scale, scale, flatness * scale)).log()
-    return Gaussians(
-        points.clone(),
-        log_scales.repeat(len(points), 1),
-        turn_z_to(normals),
-        points.new_full((len(points),), math.log(opacity / (1 - opacity))),
-        rgb_to_sh(colors),
-    )
+    return isotropic(points, points.new_full((len(points),), scale), colors, SURFACE_OPACITY)
 
 
 def isotropic(

@@ -36,12 +36,3 @@ def quat_multiply(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batc
         ),
         -1,
     )
-
-
-def turn_z_to(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Return the shortest rotations of the z axis to unit directions, as unit quaternions."""
-    x, y, z = directions.double().unbind(-1)
-    quats = torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1)
-    half_turn = quats.new_tensor((0.0, 1.0, 0.0, 0.0))  # to the opposite direction, where the formula is 0
-    quats = torch.where((1 + z > 1e-6)[:, None], quats, half_turn)
-    return torch.nn.functional.normalize(quats, dim=-1).to(directions.dtype)

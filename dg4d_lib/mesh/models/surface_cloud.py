@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.initialize import discs
 from dg4d_lib.gaussians.transform import transform
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.models.model import OPAQUE, Model
 from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
@@ -83,8 +83,22 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
     chosen, weights, colors = chosen[kept], weights[kept], colors[kept]
     means = np.einsum("nk,nkc->nc", weights, corners[chosen])
     scale = SPREAD * math.sqrt(0.5 * ends[-1] / count)
-    directions = torch.from_numpy((normals[chosen] / areas[chosen, None]).astype(np.float32))
-    points = torch.from_numpy(means.astype(np.float32))
-    cloud = discs(points, directions, scale, FLATNESS, torch.from_numpy(colors), OPACITY)
+    log_scales = torch.tensor([scale, scale, FLATNESS * scale]).log().expand(len(means), 3).clone()
+    cloud = Gaussians(
+        torch.from_numpy(means.astype(np.float32)),
+        log_scales,
+        _facing(torch.from_numpy(normals[chosen] / areas[chosen, None])),
+        torch.full((len(means),), math.log(OPACITY / (1 - OPACITY))),
+        rgb_to_sh(torch.from_numpy(colors)),
+    )
     nearest = np.take_along_axis(fine.faces[chosen], weights.argmax(1)[:, None], 1)[:, 0]
     return SurfaceCloud(fine, welded, cloud, torch.from_numpy(nearest))
+
+
+def _facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Return rotations that turn the z axis to unit normals."""
+    w = 1 + normals[:, 2]
+    quats = torch.stack([w, -normals[:, 1], normals[:, 0], torch.zeros_like(w)], 1)
+    flipped = quats.new_tensor((0.0, 1.0, 0.0, 0.0))  # the opposite direction, where the formula is 0
+    quats = torch.where((w > 1e-6)[:, None], quats, flipped)
+    return torch.nn.functional.normalize(quats, dim=-1).float()

@@ -84,7 +84,7 @@ def test_losses_stay_on_the_device_of_the_pictures(known):
 
 def test_clouds_stay_on_the_device_of_their_points():
     points = torch.zeros(COUNT, 3, device=META)
-    for cloud in (on_surface(points, points, points, 1.0), isotropic(points, points[:, 0], points, 0.5)):
+    for cloud in (on_surface(points, points, 1.0), isotropic(points, points[:, 0], points, 0.5)):
         assert {value.device for value in vars(cloud).values()} == {META}
         assert {value.device for value in vars(reset_opacity(cloud)).values()} == {META}
     gradients = Grad2dStats.zeros(COUNT, META)
