@@ -1,5 +1,6 @@
 """Step that chooses a tracked mesh or a mesh per frame, by trial meshes, before meshes are extracted."""
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -7,6 +8,7 @@ import torch
 from dg4d_lib.fitting.guided_mesh import select_guided_reference
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import select_level
+from dg4d_lib.mesh.folds import genus
 from dg4d_lib.mesh.tracking.reference_frame import select_reference_frame
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -35,7 +37,7 @@ def run(job: Job) -> StepReport:
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
     guide: Literal["gaussians", "video"] = "gaussians"
-    shapes = None
+    weights: dict[str, str] = {}
     if mode != "per_frame":
         trial = select_reference_frame(states, displacement, rasterize, settings)
         frame, followed = trial.frame, trial.iou
@@ -43,9 +45,13 @@ def run(job: Job) -> StepReport:
         if torn and "driving_video" in job.inputs:
             video = read_frames(job.inputs["driving_video"], job.pictures)
             generator = torch.Generator().manual_seed(job.seed)
+            select = partial(select_guided_reference, states, video, rasterize, settings, frame, generator)
             if settings.source == "prior" and "subject" in job.inputs:
                 shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
-            guided = select_guided_reference(states, video, rasterize, settings, frame, generator, shapes)
+                guided = select(lambda candidate: genus(shapes.surface(candidate).faces.numpy()))
+                weights = packaged.digests()
+            else:
+                guided = select()
             if mode == "tracked" or guided[1] >= settings.min_guided or followed < settings.min_followed:
                 (frame, followed), guide = guided, "video"
     if mode == "auto":
@@ -72,5 +78,4 @@ def run(job: Job) -> StepReport:
     plan = MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level, grid=grid, guide=guide)
     write_plan(job.outputs["plan"], plan)
     job.progress(2, 2, {})
-    weights = packaged.digests() if shapes else {}
     return StepReport(f"{job.settings.rasterizer} rasterizer", weights, notes=tuple(notes))

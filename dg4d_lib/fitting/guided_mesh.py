@@ -4,6 +4,8 @@ Gaussians that are fitted to fast limbs change places: those of one leg form ano
 that follows them tears. Here the mesh follows the pictures instead, and the Gaussians only give its shape.
 """
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Int
 from skimage.measure import perimeter
@@ -13,11 +15,9 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.surface_tracking import DESCENT, LOST, swinging, swinging_is_better, track_vertices
 from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, render_silhouettes, silhouette_iou
-from dg4d_lib.mesh.folds import genus
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.color_registration import register_to_colors
 from dg4d_lib.mesh.tracking.outline_registration import LAST_ROUNDS, register_to_outlines
@@ -131,7 +131,7 @@ def select_guided_reference(
     settings: MeshSettings,
     given: int,
     generator: torch.Generator,
-    shapes: SubjectShapes | None = None,
+    handles: Callable[[int], int] = lambda frame: 0,
 ) -> tuple[int, float]:
     """Select the frame whose surface follows the driving video best, by trials on a coarse grid.
 
@@ -144,7 +144,7 @@ def select_guided_reference(
         settings: mesh settings.
         given: a frame that is tried too, besides the first one and those with the longest outlines.
         generator: draws the frames of joint iterations.
-        shapes: surfaces that the mesh will have, whose handles count; None: the handles are not known.
+        handles: returns the number of handles of the surface that the mesh would have from a frame.
 
     Returns:
         The frame, and the mean intersection over union of silhouettes over frames and views, in [0, 1].
@@ -168,8 +168,7 @@ def select_guided_reference(
             vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse, TRIAL_ROUNDS
         )
         scores[frame] = float(silhouette_iou(vertices + offsets, faces, silhouettes).mean())
-    handles = {frame: genus(shapes.surface(frame).faces.numpy()) if shapes else 0 for frame in scores}
-    best = max(scores, key=lambda frame: scores[frame] - HANDLE_COST * handles[frame])
+    best = max(scores, key=lambda frame: scores[frame] - HANDLE_COST * handles(frame))
     return best, scores[best]
 
 

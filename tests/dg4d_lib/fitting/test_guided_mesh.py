@@ -1,7 +1,5 @@
 """Meshes that follow the video: legs that cross and touch on the way keep their surfaces."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 import torch
@@ -14,8 +12,6 @@ from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines
 from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
-from dg4d_lib.guidance.interface import GuidanceView
-from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
@@ -132,29 +128,16 @@ def test_a_mesh_that_loses_the_outline_is_tracked_with_limbs_that_swing(
     assert float(offsets[1, :, 0].mean()) == pytest.approx(kept, abs=1e-5)
 
 
-class RingsThenBalls:
-    """Shapes with a handle in the first frame alone."""
-
-    def surface(self, frame: int) -> InflatedSurface:
-        mesh = trimesh.creation.icosphere(1) if frame else trimesh.creation.torus(0.3, 0.1)
-        vertices = torch.tensor(mesh.vertices, dtype=torch.float32)
-        front = torch.ones(len(vertices), dtype=torch.bool)
-        return InflatedSurface(vertices, torch.tensor(mesh.faces), torch.zeros_like(vertices), front)
-
-    def clean(self, views: Sequence[GuidanceView]) -> tuple[torch.Tensor, torch.Tensor]:
-        raise NotImplementedError
-
-
 @pytest.mark.parametrize(
-    ("first", "second", "shapes", "chosen"),
+    ("first", "second", "handles", "chosen"),
     [
-        (0.95, 0.945, None, 0),
-        (0.95, 0.945, RingsThenBalls(), 3),
-        (0.96, 0.945, RingsThenBalls(), 0),
+        (0.95, 0.945, 0, 0),
+        (0.95, 0.945, 1, 3),
+        (0.96, 0.945, 1, 0),
     ],
 )
 def test_a_handle_outweighs_a_trial_that_is_a_little_better(
-    monkeypatch: pytest.MonkeyPatch, first: float, second: float, shapes: RingsThenBalls | None, chosen: int
+    monkeypatch: pytest.MonkeyPatch, first: float, second: float, handles: int, chosen: int
 ) -> None:
     overlaps = iter([first, second])
     monkeypatch.setattr(guided_mesh, "frames_with_long_outlines", lambda *_: [3])
@@ -163,7 +146,9 @@ def test_a_handle_outweighs_a_trial_that_is_a_little_better(
     monkeypatch.setattr(guided_mesh, "silhouette_iou", lambda *_: torch.tensor([next(overlaps)]))
     states = scissors()
     generator = torch.Generator().manual_seed(0)
-    frame, overlap = select_guided_reference(states, video_of(states), RASTERIZE, SETTINGS, 0, generator, shapes)
+    frame, overlap = select_guided_reference(
+        states, video_of(states), RASTERIZE, SETTINGS, 0, generator, lambda frame: 0 if frame else handles
+    )
     assert frame == chosen
     assert overlap == pytest.approx(second if chosen else first)
 
