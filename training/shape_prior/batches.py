@@ -5,7 +5,7 @@ import signal
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from multiprocessing import get_context, parent_process
 from threading import Thread
 from typing import Any
@@ -19,7 +19,7 @@ from dg4d_lib.shape_prior.frustum import BINS, SIZE
 from training.shape_prior.kernels import soft_occupancy
 from training.shape_prior.samples import Sample, make_sample
 
-AHEAD = 6  # batches that a worker makes before they are asked for
+AHEAD = 6  # batches that are made before they are asked for, at least; with many workers two for each
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,13 @@ class Batch:
     plane: Float[Tensor, "b 4"]
     symmetric: Float[Tensor, " b"]
     families: tuple[str, ...]
+
+    def to(self, device: torch.device) -> "Batch":
+        """Return the batch with its tensors on a device."""
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
 
 
 def make_batch(seed: int, number: int, size: int, rays: int) -> Batch:
@@ -98,7 +105,7 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
         try:
             for number in numbers:
                 waiting.append(pool.submit(_packed, seed, number, size, rays))
-                if len(waiting) > AHEAD:
+                if len(waiting) > max(AHEAD, 2 * workers):
                     yield _unpacked(waiting.popleft().result())
             while waiting:
                 yield _unpacked(waiting.popleft().result())

@@ -94,8 +94,9 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
 
 
 def _overlaps(found: Tensor, truth: Tensor, owner: Tensor, count: int) -> list[float]:
-    both = torch.zeros(count).index_add_(0, owner, (found & truth).float().sum(1))
-    either = torch.zeros(count).index_add_(0, owner, (found | truth).float().sum(1))
+    none = torch.zeros(count, device=found.device)
+    both = none.index_add(0, owner, (found & truth).float().sum(1))
+    either = none.index_add(0, owner, (found | truth).float().sum(1))
     return [float(value) for value in (both / either.clamp(min=1)).tolist()]
 
 

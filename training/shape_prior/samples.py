@@ -15,11 +15,13 @@ from training.shape_prior.families import FAMILIES
 from training.shape_prior.kernels import INTERVALS, MOST_SOLIDS, cross, fill, shade
 from training.shape_prior.solids import Matrix, Shape, Solid, Vector, packed, rotation, scaled, thickened
 from training.shape_prior.texture import lighting, palette
+from training.shape_prior.warp import attach, random_warp, warped
 
 THINNEST = 0.016  # half size of a solid, world units: a ray cannot step over it
 DEEPEST = 0.82  # reach in depth from the plane z = 0, world units
 CENTERED_SPAN = 0.8  # of the frame: `SubjectSettings.border` is 0.2
 SMALLEST_SHARE, LARGEST_SHARE = 0.015, 0.62  # of the frame that the subject covers
+ATTACHED, WARPED = 0.12, 0.6  # shares of the samples
 TRIES = 20
 
 
@@ -192,6 +194,12 @@ def _shown_scene(chance: Chance, family: str | None, size: int) -> tuple[_Scene,
         shape = Shape(blend=chance.pick((0.01, 0.03, 0.05)))
         recipe, _, style = FAMILIES[name]
         recipe(chance, shape)
+        if chance.happens(ATTACHED):
+            other = chance.pick(list(FAMILIES), [weight for _, weight, _ in FAMILIES.values()])
+            attach(chance, shape, FAMILIES[other][0], MOST_SOLIDS)
+        if chance.happens(WARPED):
+            warp = random_warp(chance, shape)
+            shape.solids = [warped(solid, warp) for solid in shape.solids]
         pose = _pose(chance, [solid for solid in shape.solids[:MOST_SOLIDS] if solid.operation == 0])
         scene = _Scene(shape, pose, name, np.empty((0, 0)), np.empty(10))
         seen = _Seen.of(scene, size)

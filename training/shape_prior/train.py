@@ -1,4 +1,4 @@
-"""Training of the shape prior: resumable, deterministic for a seed and a thread count.
+"""Training of the shape prior: resumable, deterministic for a seed and a thread count, on processors.
 
 python -m training.shape_prior.train out/shape_prior --samples 600000
 """
@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch import nn
+from torch import Tensor, nn
 
 from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, load_network, save_network
 from training.shape_prior.batches import Batch, batches, make_batch
@@ -30,6 +30,7 @@ from training.shape_prior.losses import training_losses, validation_figures
 from training.shape_prior.muon import Muon
 
 VALIDATION_SEED = 1_000_003  # no training run uses it
+CPU = torch.device("cpu")
 CHECKPOINT, WEIGHTS, CURVES = "checkpoint.pt", "network.safetensors", "curves"
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # of glibc's mallopt
 _log = logging.getLogger(__name__)
@@ -72,20 +73,21 @@ class Plan:
 class Run:
     """State of one training run: networks, optimizer, samples shown, figures."""
 
-    def __init__(self, plan: Plan, config: ShapePriorConfig) -> None:
+    def __init__(self, plan: Plan, config: ShapePriorConfig, device: torch.device = CPU) -> None:
         self.plan = plan
+        self.device = device
         torch.manual_seed(plan.seed)
-        self.network = channels_last(ShapePriorNetwork(config))
+        self.network = channels_last(ShapePriorNetwork(config)).to(device)
         self.average = deepcopy(self.network).eval()
         self.optimizers = make_optimizers(self.network, plan)
         self.shown = 0
         self.curve: list[dict[str, float]] = []
 
-    def step(self, batch: Batch) -> dict[str, float]:
-        """Show one batch; return its losses."""
+    def step(self, batch: Batch) -> dict[str, Tensor]:
+        """Show one batch; return its losses, on the device of the network."""
         for group in (group for optimizer in self.optimizers for group in optimizer.param_groups):
             group["lr"] = self.plan.lr_at(self.shown)
-        losses = training_losses(self.network, batch)
+        losses = training_losses(self.network, batch.to(self.device))
         self.network.zero_grad(set_to_none=True)
         losses.total().backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -96,7 +98,7 @@ class Run:
         weight = 1 - min(self.plan.ema, (1 + steps) / (10 + steps))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
-        return {name: float(value.detach()) for name, value in vars(losses).items()}
+        return {name: value.detach() for name, value in vars(losses).items()}
 
     def save(self, folder: Path) -> None:
         """Write the checkpoint and the averaged weights, each in one move."""
@@ -115,10 +117,10 @@ class Run:
         (folder / f"{WEIGHTS}.new").replace(folder / WEIGHTS)
 
     @classmethod
-    def load(cls, folder: Path, plan: Plan) -> "Run":
+    def load(cls, folder: Path, plan: Plan, device: torch.device = CPU) -> "Run":
         """Return the run of a checkpoint; its plan holds, but for the number of samples."""
-        state = torch.load(folder / CHECKPOINT, weights_only=True)
-        run = cls(Plan(**{**state["plan"], "samples": plan.samples}), _config(state["config"]))
+        state = torch.load(folder / CHECKPOINT, weights_only=True, map_location=device)
+        run = cls(Plan(**{**state["plan"], "samples": plan.samples}), _config(state["config"]), device)
         run.network.load_state_dict(state["network"])
         run.average.load_state_dict(state["average"])
         for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
@@ -135,7 +137,7 @@ class Run:
         if path.suffix == ".safetensors":
             other = load_network(path).state_dict()
         else:
-            other = torch.load(path, weights_only=True)["average"]
+            other = torch.load(path, weights_only=True, map_location=CPU)["average"]
         own = self.network.state_dict()
         fitting = {name: value for name, value in other.items() if name in own and own[name].shape == value.shape}
         for network in (self.network, self.average):
@@ -172,7 +174,7 @@ def train(
     """
     plan = run.plan
     folder.mkdir(parents=True, exist_ok=True)
-    held_out = [make_batch(VALIDATION_SEED, number, plan.batch, 1024) for number in range(plan.held_out)]
+    held_out = [make_batch(VALIDATION_SEED, number, plan.batch, 1024).to(run.device) for number in range(plan.held_out)]
     left = (plan.samples - run.shown) // plan.batch
     stream = batches(plan.seed, run.shown // plan.batch, left, plan.batch, plan.rays, workers)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -202,18 +204,18 @@ class Means:
     """Running means of named numbers."""
 
     def __init__(self) -> None:
-        self._sums: dict[str, float] = {}
+        self._sums: dict[str, Tensor] = {}
         self._count = 0
 
-    def add(self, values: dict[str, float]) -> None:
-        """Add one number per name."""
+    def add(self, values: dict[str, Tensor]) -> None:
+        """Add one number per name, without waiting for it."""
         self._count += 1
         for name, value in values.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
+            self._sums[name] = self._sums[name] + value if name in self._sums else value
 
     def take(self) -> dict[str, float]:
         """Return the means since the last call."""
-        means = {f"train_{name}": value / max(1, self._count) for name, value in self._sums.items()}
+        means = {f"train_{name}": float(value) / max(1, self._count) for name, value in self._sums.items()}
         self._sums, self._count = {}, 0
         return means
 
@@ -236,6 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
     parser.add_argument("--widths", type=int, nargs=4, default=ShapePriorConfig.widths)
     parser.add_argument("--layers", type=int, default=ShapePriorConfig.layers)
+    parser.add_argument("--device", type=torch.device, default=CPU, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that make shapes")
     parser.add_argument("--every", type=int, default=16_000, help="samples between two validations")
@@ -244,13 +247,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     keep_freed_memory()
     torch.set_num_threads(given.threads)
+    torch.set_float32_matmul_precision("high")  # TF32 on GPUs; processors have none
     plan = Plan(**{name: getattr(given, name) for name in asdict(Plan())})
     given.folder.mkdir(parents=True, exist_ok=True)
     if (given.folder / CHECKPOINT).exists():
-        run = Run.load(given.folder, plan)
+        run = Run.load(given.folder, plan, given.device)
         _log.info("resumed at %d of %d samples", run.shown, plan.samples)
     else:
-        run = Run(plan, ShapePriorConfig(widths=tuple(given.widths), layers=given.layers))
+        run = Run(plan, ShapePriorConfig(widths=tuple(given.widths), layers=given.layers), given.device)
         if given.warm_start:
             _log.info("warm start; new: %s", run.warm_start(given.warm_start))
     parameters = sum(value.numel() for value in run.network.parameters())

@@ -51,6 +51,21 @@ def test_a_tiny_network_learns(tmp_path: Path) -> None:
     assert load_network(tmp_path / training.WEIGHTS).config == TINY
 
 
+@pytest.mark.gpu
+def test_a_gpu_trains_as_the_processor_does(tmp_path: Path) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("there is no CUDA device here")
+    made, losses = [make_batch(1, number, 4, 256) for number in range(12)], {}
+    for device in (torch.device("cpu"), torch.device("cuda")):
+        run = training.Run(plan(48), TINY, device)
+        losses[device.type] = [float(run.step(batch)["occupancy"]) for batch in made]
+        run.save(tmp_path)
+    assert losses["cuda"] == pytest.approx(losses["cpu"], rel=0.03)
+    resumed = training.Run.load(tmp_path, plan(48))  # on the processor what the GPU left
+    assert resumed.shown == 48
+    assert resumed.network.stem.weight.device.type == "cpu"
+
+
 def test_a_run_that_was_stopped_gives_the_same_weights(tmp_path: Path) -> None:
     whole = training.Run(plan(32), TINY)
     training.train(whole, tmp_path / "whole", workers=0, every=16)
