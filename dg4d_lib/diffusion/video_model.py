@@ -35,7 +35,7 @@ SIGMA_MAX, SIGMA_MIN, RHO = 700.0, 0.002, 7.0
 GIB = 2**30  # bytes
 OVERHEAD_GB = 1.5  # renders and the CUDA context
 # GiB per byte of the dtype, megapixel and frame: measured tensors of the published networks plus 10 %
-ENCODER_GB, DECODER_GB, UNET_GB = 0.66, 1.05, 0.15
+ENCODER_GB, DECODER_GB, UNET_GB = 0.8, 1.05, 0.15
 
 
 def karras_sigmas(steps: int) -> tuple[float, ...]:
