@@ -40,7 +40,6 @@ fi
 if [ "$CUDA" = 1 ]; then
     lacks=$("$VENV/bin/python" -c 'from dg4d_lib.rasterizer.backends import gsplat_unavailable_reason; print(gsplat_unavailable_reason())')
     [ -z "$lacks" ] || echo "The GPU cannot be used yet: $lacks" >&2
-    command -v nvcc >/dev/null || [ -x "${CUDA_HOME:-/usr/local/cuda}/bin/nvcc" ] || {
-        echo "gsplat compiles its kernels at first use and needs nvcc (CUDA toolkit 13.0) and g++." >&2
-        echo "Neither the PATH nor \$CUDA_HOME has nvcc: https://developer.nvidia.com/cuda-downloads" >&2; }
+    PATH="$PWD/$VENV/bin:$VENV/bin:$PATH" "$VENV/bin/python" deploy/gsplat_kernels.py || {
+        echo "Without them gsplat compiles when it first draws, which needs nvcc of CUDA 13.0 on the PATH." >&2; }
 fi

@@ -1,9 +1,6 @@
 # The steps on NVIDIA GPUs: as cpu.Dockerfile, with torch for CUDA 13, gsplat's kernels and the diffusion models.
 # The kernels are compiled here, for the GPUs of $ARCHITECTURES, so the image needs no compiler when it runs.
 ARG PYTHON=python:3.11.16-slim-bookworm@sha256:528257d48c1da0dcecc2e725d1ae34498d60c965f1241e39cd6a85a8859bdf84
-ARG CUDA=nvidia/cuda:13.0.3-devel-ubuntu22.04@sha256:3869b846a8cc495ce11c172d87cfc0da8874b910d14a9810bec6b6182e9ee9f8
-
-FROM ${CUDA} AS toolkit
 
 FROM ${PYTHON} AS packages
 ARG ARCHITECTURES="7.5 8.0 8.6 8.9 9.0 12.0"
@@ -15,9 +12,9 @@ RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     python -m venv /opt/dg4d && VENV=/opt/dg4d bash deploy/install.sh steps cuda
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
-COPY --from=toolkit /usr/local/cuda /usr/local/cuda
-COPY deploy/images/gsplat_kernels.py ./
-RUN CUDA_HOME=/usr/local/cuda TORCH_CUDA_ARCH_LIST="${ARCHITECTURES}" PATH="/opt/dg4d/bin:$PATH" python gsplat_kernels.py
+COPY deploy/gsplat_kernels.py deploy/
+RUN TORCH_CUDA_ARCH_LIST="${ARCHITECTURES}" PATH="/opt/dg4d/bin:$PATH" python deploy/gsplat_kernels.py && \
+    /opt/dg4d/bin/pip uninstall --yes nvidia-cuda-nvcc nvidia-cuda-crt nvidia-nvvm nvidia-cuda-cccl
 
 FROM packages AS code
 COPY pyproject.toml README.md LICENSE ./

@@ -31,7 +31,7 @@ SETUP, SETUP_CUDA = "make setup", "make setup CUDA=1"
 GIB = 2**30
 
 State = Literal["ready", "slow", "missing"]
-Kernels = Literal["compiled", "compiled at the first use", "cannot be compiled", "not installed"]
+Kernels = Literal["compiled", "compiled at the first use", "not compiled: run `make setup CUDA=1`", "not installed"]
 
 
 class Gpu(Frozen):
@@ -215,7 +215,7 @@ def _gsplat_kernels() -> Kernels:
         return "compiled"
     cuda_home = os.environ.get("CUDA_HOME")
     nvcc = shutil.which("nvcc") or (cuda_home and shutil.which("nvcc", path=str(Path(cuda_home) / "bin")))
-    return "compiled at the first use" if nvcc and shutil.which("g++") else "cannot be compiled"
+    return "compiled at the first use" if nvcc and shutil.which("g++") else "not compiled: run `make setup CUDA=1`"
 
 
 def _driver_version() -> str:

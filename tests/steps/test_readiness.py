@@ -153,7 +153,7 @@ def test_kernels_are_in_the_wheel_in_the_cache_or_need_a_compiler(
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CUDA_HOME", raising=False)
-    assert readiness._gsplat_kernels() == "cannot be compiled"
+    assert readiness._gsplat_kernels() == "not compiled: run `make setup CUDA=1`"
     (tmp_path / "bin").mkdir()
     for name in ("nvcc", "g++"):
         (tmp_path / "bin" / name).write_text("#!/bin/sh\n")
