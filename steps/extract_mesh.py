@@ -1,5 +1,6 @@
 """Step that extracts textured meshes from moving Gaussians: one tracked mesh, or a mesh per frame."""
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,9 +20,9 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.images import color_over_white
 from dg4d_lib.inflation.render import render_surface
-from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
@@ -81,6 +82,26 @@ class RestShape(NamedTuple):
     draw: Draw
 
 
+class Candidate(NamedTuple):
+    """Surface of one frame, tracked through the driving video.
+
+    Attributes:
+        frame: of the surface.
+        rest: the surface.
+        offsets: of its vertices at every frame.
+        mesh: textured from the video, split along seams.
+        sources: vertex that every split vertex copies.
+        psnr: of its renders against the video, dB.
+    """
+
+    frame: int
+    rest: RestShape
+    offsets: Float[Tensor, "t v 3"]
+    mesh: TexturedMesh
+    sources: Int[Tensor, " w"]
+    psnr: float
+
+
 def run(job: Job) -> StepReport:
     """Extract the tracked mesh, or the meshes of frames `first_frame` to `end_frame`, as the plan says.
 
@@ -93,28 +114,29 @@ def run(job: Job) -> StepReport:
     frames_of_task: FrameRange = job.settings
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
-    frames, guess = len(states.means), None
+    frames, weights = len(states.means), {}
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
         job.progress(1, 3, {})
+        guesses = None
         if settings.source == "prior" and video and "subject" in job.inputs:
-            shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
-            guess = shapes.surface(plan.reference_frame)
-        rest = _rest_shape(states.at(plan.reference_frame), plan.level, rasterize, settings, guess)
+            guesses = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
+            weights = packaged.digests()
+        rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses)
         if video and plan.guide == "video":
-            generator = torch.Generator().manual_seed(job.seed)
-            tracked, ious = _guided(rest, states, video, plan, rasterize, settings, generator)
+            tracked, ious, notes = _guided(rest_shape, states, video, plan, rasterize, settings, job.seed)
         else:
-            tracked, ious = _tracked(rest, states, displacement, plan, rasterize, settings, video)
+            rest = rest_shape(plan.reference_frame)
+            tracked, ious, notes = _tracked(rest, states, displacement, plan, rasterize, settings, video)
         job.progress(2, 3, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
-        kind = "isosurface of the Gaussians" if guess is None else "shape network's surface"
+        kind = "isosurface of the Gaussians" if guesses is None else "shape network's surface"
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
             f"at rest it is {_check(mesh)}",
-            f"it is the {kind} of frame {plan.reference_frame}, which follows the "
-            f"{FOLLOWED[plan.guide]} best ({plan.followed:.1%} IoU on trial)",
+            f"it is the {kind} of frame {tracked.reference_frame:g}, which follows the {FOLLOWED[plan.guide]} best",
+            *notes,
             f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
         ]
         if ious.mean() < MIN_IOU:
@@ -131,7 +153,6 @@ def run(job: Job) -> StepReport:
         notes = _soundness(meshes)
         mesh = meshes[first]
     write_png(job.outputs["picture"], _picture(mesh))
-    weights = packaged.digests() if guess is not None else {}
     return StepReport(f"{job.settings.rasterizer} rasterizer, pymeshlab", weights, notes=tuple(notes))
 
 
@@ -157,14 +178,20 @@ def _driving_video(job: Job, frames: int) -> DrivingVideo | None:
 
 
 def _rest_shape(
-    gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings, guess: InflatedSurface | None
+    states: Gaussians,
+    level: float,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    guesses: SubjectShapes | None,
+    frame: int,
 ) -> RestShape:
-    """Return the guess, or without one the isosurface of the Gaussians."""
-    if guess is None:
+    """Return the guess of a frame, or without guesses the isosurface of the Gaussians."""
+    gaussians = states.at(frame)
+    if guesses is None:
         return RestShape(
             *_isosurface(gaussians, level, rasterize, settings), gaussians, drawn_gaussians(gaussians, rasterize)
         )
-    unit = density_field(gaussians, settings).unit
+    guess, unit = guesses.surface(frame), density_field(gaussians, settings).unit
     vertices, faces = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
     return RestShape(*_faired(vertices, faces, settings), gaussians, partial(render_surface, guess))
 
@@ -177,8 +204,8 @@ def _tracked(
     rasterize: Rasterizer,
     settings: MeshSettings,
     video: DrivingVideo | None,
-) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
-    """Return the mesh of the reference frame with its offsets at every frame, and the IoU of its outlines."""
+) -> tuple[TrackedMesh, Float[Tensor, " t"], list[str]]:
+    """Return the mesh of the reference frame with its offsets at every frame, the IoU of its outlines, and notes."""
     frame, level = plan.reference_frame, plan.level
     vertices, faces = rest.vertices, rest.faces
     with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
@@ -193,34 +220,70 @@ def _tracked(
         mesh, sources = coloring.result()
     if video is not None:
         mesh = _fitted(mesh, vertices + offsets, faces, sources, video)
-    return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious
+    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU"]
+    return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
 
 def _guided(
-    rest: RestShape,
+    rest_shape: Callable[[int], RestShape],
     states: Gaussians,
     video: DrivingVideo,
     plan: MeshPlan,
     rasterize: Rasterizer,
     settings: MeshSettings,
-    generator: torch.Generator,
-) -> tuple[TrackedMesh, Float[Tensor, " t"]]:
-    """Return the mesh that follows the driving video, with colors from it, and the IoU of its outlines."""
-    frame, level = plan.reference_frame, plan.level
-    vertices, faces = rest.vertices, rest.faces
-    offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
-    mesh, sources = _colored(
-        vertices, faces, rest.draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
-    )
-    refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
+    seed: int,
+) -> tuple[TrackedMesh, Float[Tensor, " t"], list[str]]:
+    """Return the mesh that follows the driving video, with colors from it, the IoU of its outlines, and notes.
+
+    Where the plan names several frames, each of their surfaces follows the video; the one that shows it best stays.
+    """
+    level = plan.level
+    candidates = [
+        _follow(frame, rest_shape(frame), states, video, level, rasterize, settings, seed)
+        for frame in (plan.reference_frame, *plan.rivals)
+    ]
+    best = max(candidates, key=lambda candidate: candidate.psnr)
+    vertices, faces, sources = best.rest.vertices, best.rest.faces, best.sources
+    refined = refine_tracking(
+        best.mesh, sources, vertices, best.offsets, faces, states, video, level, rasterize, settings
+    )  # fmt: skip
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined = turn_back(vertices, refined, faces, silhouettes)
     moved = vertices + refined
-    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
-    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, rest.draw, settings, footage)
-    mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
-    tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=frame)
-    return tracked, silhouette_iou(moved, faces, silhouettes)
+    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, best.mesh)
+    draw = best.rest.draw
+    texture = bake_texture(best.mesh.vertices, normals, best.mesh.faces, best.mesh.uvs, draw, settings, footage)
+    mesh = _fitted(replace(best.mesh, texture=texture), moved, faces, sources, video)
+    tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=best.frame)
+    notes = [f"a trial mesh of frame {plan.reference_frame} had {plan.followed:.1%} IoU"]
+    if plan.rivals:
+        scores = ", ".join(f"frame {candidate.frame} {candidate.psnr:.1f} dB" for candidate in candidates)
+        notes.append(f"tracked in full, before the last registration: {scores} (PSNR at the input view)")
+    return tracked, silhouette_iou(moved, faces, silhouettes), notes
+
+
+def _follow(
+    frame: int,
+    rest: RestShape,
+    states: Gaussians,
+    video: DrivingVideo,
+    level: float,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+    seed: int,
+) -> Candidate:
+    """Track the surface of one frame through the driving video, and texture it from there."""
+    vertices, faces = rest.vertices, rest.faces
+    generator = torch.Generator().manual_seed(seed)
+    offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
+    moved = vertices + offsets
+    mesh, sources = _colored(
+        vertices, faces, rest.draw, settings, lambda sources: _footage(moved, faces, sources, video)
+    )  # fmt: skip
+    shown = _footage(moved, faces, sources, video)
+    errors = [_squared_error(replace(mesh, vertices=surface.vertices), surface) for surface in shown]
+    psnr = sum(-10 * math.log10(max(error, LEAST_ERROR)) for error in errors) / len(errors)
+    return Candidate(frame, rest, offsets, mesh, sources, psnr)
 
 
 def _fitted(

@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 
-from dg4d_lib.fitting.guided_mesh import select_guided_reference
+from dg4d_lib.fitting.guided_mesh import rank_guided_references
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import select_level
 from dg4d_lib.mesh.folds import genus
@@ -36,6 +36,7 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
+    rivals: tuple[int, ...] = ()
     guide: Literal["gaussians", "video"] = "gaussians"
     weights: dict[str, str] = {}
     if mode != "per_frame":
@@ -45,15 +46,16 @@ def run(job: Job) -> StepReport:
         if torn and "driving_video" in job.inputs:
             video = read_frames(job.inputs["driving_video"], job.pictures)
             generator = torch.Generator().manual_seed(job.seed)
-            select = partial(select_guided_reference, states, video, rasterize, settings, frame, generator)
+            rank = partial(rank_guided_references, states, video, rasterize, settings, frame, generator)
             if settings.source == "prior" and "subject" in job.inputs:
                 shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
-                guided = select(lambda candidate: genus(shapes.surface(candidate).faces.numpy()))
+                ranked = rank(lambda candidate: genus(shapes.surface(candidate).faces.numpy()))
                 weights = packaged.digests()
             else:
-                guided = select()
-            if mode == "tracked" or guided[1] >= settings.min_guided or followed < settings.min_followed:
-                (frame, followed), guide = guided, "video"
+                ranked = rank()
+            if mode == "tracked" or ranked[0][1] >= settings.min_guided or followed < settings.min_followed:
+                (frame, followed), guide = ranked[0], "video"
+                rivals = tuple(other for other, _ in ranked[1:])
     if mode == "auto":
         least = settings.min_followed if guide == "gaussians" else settings.min_guided
         mode = "tracked" if followed >= least else "per_frame"
@@ -62,7 +64,7 @@ def run(job: Job) -> StepReport:
                 f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.{LIMITS[guide]} asks for "
                 f"{least:.0%}): every frame gets its own"
             )
-            frame, guide = 0, "gaussians"
+            frame, guide, rivals = 0, "gaussians", ()
     job.progress(1, 2, {})
     rest = states.at(frame)
     level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
@@ -75,7 +77,9 @@ def run(job: Job) -> StepReport:
                 f"thin parts: the density field has {grid} samples along every axis (mesh.grid={settings.grid})"
             )
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
-    plan = MeshPlan(mode=mode, reference_frame=frame, followed=followed, level=level, grid=grid, guide=guide)
+    plan = MeshPlan(
+        mode=mode, reference_frame=frame, rivals=rivals, followed=followed, level=level, grid=grid, guide=guide
+    )
     write_plan(job.outputs["plan"], plan)
     job.progress(2, 2, {})
     return StepReport(f"{job.settings.rasterizer} rasterizer", weights, notes=tuple(notes))

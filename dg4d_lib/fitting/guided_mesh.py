@@ -36,6 +36,7 @@ TRIAL_GRID = 48  # cells per axis of the density field
 CANDIDATES = 3  # candidate frames with long outlines, besides the given ones
 HANDLE_COST = 0.01  # of the trial's IoU by which another frame may be worse for each handle that it has less
 APART = 1 / 10  # smallest distance of two candidates, share of the frames
+SHORTLIST, MARGIN = 2, 0.03  # frames that are worth a whole extraction, and how far below the best trial
 
 
 def follow_video(
@@ -124,7 +125,7 @@ def refine_tracking(
     return register_to_outlines(vertices, offsets, faces, states, alpha, level, rasterize, settings, LAST_ROUNDS)
 
 
-def select_guided_reference(
+def rank_guided_references(
     states: Gaussians,
     video: DrivingVideo,
     rasterize: Rasterizer,
@@ -132,8 +133,8 @@ def select_guided_reference(
     given: int,
     generator: torch.Generator,
     handles: Callable[[int], int] = lambda frame: 0,
-) -> tuple[int, float]:
-    """Select the frame whose surface follows the driving video best, by trials on a coarse grid.
+) -> list[tuple[int, float]]:
+    """Rank frames by how well their surfaces follow the driving video, by trials on a coarse grid.
 
     A frame yields to another one whose surface has fewer handles, where limbs that touch have grown together.
 
@@ -147,7 +148,8 @@ def select_guided_reference(
         handles: returns the number of handles of the surface that the mesh would have from a frame.
 
     Returns:
-        The frame, and the mean intersection over union of silhouettes over frames and views, in [0, 1].
+        Up to two frames that are about equal, the best first, each with the mean intersection over union of silhouettes
+        over frames and views, in [0, 1].
 
     Raises:
         FitDiverged: the cloud is empty, or the loss became non-finite.
@@ -168,8 +170,10 @@ def select_guided_reference(
             vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse, TRIAL_ROUNDS
         )
         scores[frame] = float(silhouette_iou(vertices + offsets, faces, silhouettes).mean())
-    best = max(scores, key=lambda frame: scores[frame] - HANDLE_COST * handles(frame))
-    return best, scores[best]
+    merits = {frame: score - HANDLE_COST * handles(frame) for frame, score in scores.items()}
+    ranked = sorted(merits, key=lambda frame: -merits[frame])
+    near = [frame for frame in ranked if merits[frame] > merits[ranked[0]] - MARGIN]
+    return [(frame, scores[frame]) for frame in near[:SHORTLIST]]
 
 
 def frames_with_long_outlines(video: DrivingVideo, count: int) -> list[int]:

@@ -105,8 +105,8 @@ def _require_kernels() -> None:
         first_line = str(failure or "").partition("\n")[0]
         reason = f" ({first_line})" if first_line else ""
         raise BackendUnavailable(
-            f"gsplat's CUDA kernels are missing{reason}: run `make setup CUDA=1` where the GPU is, which compiles them, or "
-            "install the CUDA toolkit (nvcc) of torch's CUDA version; or choose rasterizer=cpu"
+            f"gsplat's CUDA kernels are missing{reason}: run `make setup CUDA=1` where the GPU is; it compiles them, "
+            "or install the CUDA toolkit (nvcc) of torch's CUDA version; or choose rasterizer=cpu"
         ) from failure
 
 

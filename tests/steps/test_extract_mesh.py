@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import FramewiseSettings, LearnedPriorSettings, MeshSettings
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
-from steps import plan_mesh
+from steps import extract_mesh, plan_mesh
 from steps.artifacts.media import read_png, write_frames
 from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import read_meshes, read_tracked
@@ -185,7 +186,7 @@ def test_the_video_guides_where_the_gaussians_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trial: Trial
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: trial)
-    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
+    monkeypatch.setattr(plan_mesh, "rank_guided_references", lambda *given: [(2, 0.9)])
     green_video(tmp_path / "video")
     make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     plan = read_plan(tmp_path / "plan")
@@ -196,7 +197,7 @@ def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
-    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.9))
+    monkeypatch.setattr(plan_mesh, "rank_guided_references", lambda *given: [(2, 0.9)])
     monkeypatch.setattr(
         guided_mesh,
         "TRACKING",
@@ -208,7 +209,29 @@ def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
     shown, covered = render_mesh(asset.mesh, [CAMERA] * FRAMES, asset.offsets)
     assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
     assert shown[covered[..., 0] == 1].mean(0).argmax() == 1  # green, from the video
-    assert any("follows the driving video best (90.0% IoU" in note for note in facts.notes)
+    assert any("frame 2, which follows the driving video best" in note for note in facts.notes)
+    assert "a trial mesh of frame 2 had 90.0% IoU" in facts.notes
+
+
+def test_of_two_frames_the_one_whose_mesh_shows_the_video_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mesh of frame 2 stands still, that of frame 0 goes with the ball."""
+
+    def follow(vertices: torch.Tensor, faces: object, states: object, video: object, frame: int, *_: object) -> object:
+        steps = torch.arange(FRAMES).float()[:, None, None] * SHIFT
+        return (steps if frame == 0 else torch.zeros_like(steps)).expand(-1, len(vertices), -1).contiguous()
+
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
+    monkeypatch.setattr(plan_mesh, "rank_guided_references", lambda *given: [(2, 0.9), (0, 0.89)])
+    monkeypatch.setattr(extract_mesh, "follow_video", follow)
+    green_video(tmp_path / "video")
+    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
+    assert read_plan(tmp_path / "plan").rivals == (0,)
+    assert read_tracked(tmp_path / "tracked").reference_frame == 0
+    (compared,) = [note for note in facts.notes if note.startswith("tracked in full")]
+    worse, better = map(float, re.findall(r"frame \d ([\d.]+) dB", compared))
+    assert worse < better - 3
 
 
 @pytest.mark.parametrize("source", ["prior", "gaussians"])
@@ -232,7 +255,7 @@ def test_what_no_trial_follows_gets_a_mesh_per_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_video: bool
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.8, 0.0))
-    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.84))
+    monkeypatch.setattr(plan_mesh, "rank_guided_references", lambda *given: [(2, 0.84)])
     green_video(tmp_path / "video")
     video = tmp_path / "video" if with_video else None
     _, facts = make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=video)
@@ -263,7 +286,7 @@ def test_a_stretched_mesh_that_the_video_guides_no_better_stays_with_its_gaussia
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.95, 0.4))
-    monkeypatch.setattr(plan_mesh, "select_guided_reference", lambda *given: (2, 0.84))
+    monkeypatch.setattr(plan_mesh, "rank_guided_references", lambda *given: [(2, 0.84)])
     green_video(tmp_path / "video")
     make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     plan = read_plan(tmp_path / "plan")

@@ -8,7 +8,7 @@ import trimesh
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting import guided_mesh
-from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, select_guided_reference
+from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, rank_guided_references
 from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
@@ -146,11 +146,26 @@ def test_a_handle_outweighs_a_trial_that_is_a_little_better(
     monkeypatch.setattr(guided_mesh, "silhouette_iou", lambda *_: torch.tensor([next(overlaps)]))
     states = scissors()
     generator = torch.Generator().manual_seed(0)
-    frame, overlap = select_guided_reference(
+    ranked = rank_guided_references(
         states, video_of(states), RASTERIZE, SETTINGS, 0, generator, lambda frame: 0 if frame else handles
     )
-    assert frame == chosen
-    assert overlap == pytest.approx(second if chosen else first)
+    assert ranked[0] == (chosen, pytest.approx(second if chosen else first))
+
+
+@pytest.mark.parametrize(("scores", "frames"), [((0.95, 0.93, 0.94), [0, 4]), ((0.95, 0.91, 0.90), [0])])
+def test_rivals_are_about_as_good_as_the_best(
+    monkeypatch: pytest.MonkeyPatch, scores: tuple[float, ...], frames: list[int]
+) -> None:
+    overlaps = iter(scores)
+    monkeypatch.setattr(guided_mesh, "frames_with_long_outlines", lambda *_: [2, 4])
+    monkeypatch.setattr(guided_mesh, "track_vertices", lambda vertices, *_: vertices.repeat(FRAMES, 1, 1))
+    monkeypatch.setattr(guided_mesh, "register_to_outlines", lambda vertices, offsets, *_: offsets)
+    monkeypatch.setattr(guided_mesh, "silhouette_iou", lambda *_: torch.tensor([next(overlaps)]))
+    states = scissors()
+    ranked = rank_guided_references(
+        states, video_of(states), RASTERIZE, SETTINGS, 0, torch.Generator().manual_seed(0)
+    )  # fmt: skip
+    assert [frame for frame, _ in ranked] == frames
 
 
 @pytest.mark.slow
@@ -158,7 +173,7 @@ def test_the_chosen_frame_has_the_legs_apart(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(guided_mesh, "TRIAL", FAST.model_copy(update={"track_iterations": 5}))
     states = scissors()
     middle = FRAMES // 2
-    frame, followed = select_guided_reference(
+    (frame, followed), *_ = rank_guided_references(
         states, video_of(states), RASTERIZE, SETTINGS, middle, torch.Generator().manual_seed(0)
     )
     assert frame != middle
