@@ -34,6 +34,7 @@ from dg4d_lib.mesh.fairing import fair
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture, drawn_gaussians
+from dg4d_lib.mesh.texturing.chart_packing import QUICK, THOROUGH, Effort
 from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
@@ -162,7 +163,7 @@ def textured_mesh(
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
     vertices, faces = _isosurface(gaussians, level, rasterize, settings)
     shown = _shown(vertices, faces, frame)
-    mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown)
+    mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
 
 
@@ -361,9 +362,10 @@ def _colored(
     draw: Draw,
     settings: MeshSettings,
     footage: Footage,
+    effort: Effort = THOROUGH,
 ) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
     """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
-    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size, settings.unwrap)
+    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size, settings.unwrap, effort)
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
     moments = footage(sources)

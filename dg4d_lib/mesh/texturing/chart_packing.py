@@ -5,7 +5,7 @@ in which its center then lies lowest. Several orders are tried. Charts are turne
 """
 
 import math
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 FINEST = 512  # cells per side of the grid of places, at most
 GAP = 2  # texels between charts, at least
-TURNS = 8  # rotations of a chart that are tried
 MOST_SHAPES = 640  # charts times turns; more charts are turned less
-ORDERS = 8  # orders of the charts that are tried: the first by area, the others disturbed
 DISTURBANCE = 0.25  # standard deviation of the logarithm of the area in a disturbed order
-FIRST_COVERAGE, STEP = 0.66, 0.01  # share of the texture that is tried first, and its increments
+FIRST_COVERAGE = 0.66  # share of the texture that is tried first
 LEAST_COVERAGE = 0.03  # share of the texture below which charts count as too many
 GOLDEN = 0.618  # multiples of this share of a length are spread evenly
 
@@ -26,8 +24,29 @@ Array = NDArray[np.float64]
 Placed = list[tuple[NDArray[np.int64], Array]]  # vertices of every chart and their places, cells
 
 
+class Effort(NamedTuple):
+    """How many ways of packing are tried.
+
+    Attributes:
+        turns: rotations of a chart.
+        orders: of the charts: the first by area, the others disturbed.
+        step: increments of the share of the texture that the charts cover.
+    """
+
+    turns: int
+    orders: int
+    step: float
+
+
+QUICK, THOROUGH = Effort(8, 8, 0.01), Effort(16, 48, 0.005)  # a tenth of a second to one, and one to three
+
+
 def pack_charts(
-    flat: Float[np.ndarray, "w 2"], faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, " f"], size: int
+    flat: Float[np.ndarray, "w 2"],
+    faces: Int[np.ndarray, "f 3"],
+    labels: Int[np.ndarray, " f"],
+    size: int,
+    effort: Effort = QUICK,
 ) -> Float[np.ndarray, "w 2"] | None:
     """Place charts side by side, all at one scale and at least two texels apart.
 
@@ -36,6 +55,7 @@ def pack_charts(
         faces: triangles of all charts.
         labels: chart of every face, numbered from 0.
         size: side of the texture, texels.
+        effort: ways of packing that are tried.
 
     Returns:
         Texture coordinates in [0, 1], v down; None if there is no room for so many charts.
@@ -44,8 +64,8 @@ def pack_charts(
     gap = -(-GAP * grid // size)  # cells
     order = np.argsort(labels, kind="stable")
     members = np.split(faces[order], np.flatnonzero(np.diff(labels[order])) + 1)
-    turns = int(np.clip(MOST_SHAPES // len(members), 1, TURNS))
-    best = _place_all([_Chart(flat, part, turns, gap) for part in members], grid, gap)
+    turns = int(np.clip(MOST_SHAPES // len(members), 1, effort.turns))
+    best = _place_all([_Chart(flat, part, turns, gap) for part in members], grid, gap, effort)
     if best is None:
         return None
     uvs = np.zeros(flat.shape)
@@ -100,12 +120,12 @@ def _turn(points: Array, angle: float) -> Array:
     return np.asarray(turned - turned.min(0))
 
 
-def _place_all(charts: list[_Chart], grid: int, gap: int) -> Placed | None:
+def _place_all(charts: list[_Chart], grid: int, gap: int, effort: Effort) -> Placed | None:
     """Place all charts at the largest scale that is found, or return None if there is none."""
     total, areas = sum(chart.area for chart in charts), np.array([chart.area for chart in charts])
     generator = np.random.default_rng(0)
     best, covered = None, FIRST_COVERAGE
-    for _ in range(ORDERS if len(charts) <= MOST_SHAPES else 1):
+    for _ in range(effort.orders if len(charts) <= MOST_SHAPES else 1):
         noise = generator.normal(size=len(charts)) * (DISTURBANCE if best is not None else 0)
         order = [charts[index] for index in np.argsort(noise - np.log(areas), kind="stable")]
         while best is None and covered > LEAST_COVERAGE:
@@ -113,8 +133,8 @@ def _place_all(charts: list[_Chart], grid: int, gap: int) -> Placed | None:
             covered = covered if best is not None else 0.95 * covered
         if best is None:
             return None
-        while (better := _place(order, grid, gap, grid * np.sqrt((covered + STEP) / total))) is not None:
-            best, covered = better, covered + STEP
+        while (better := _place(order, grid, gap, grid * np.sqrt((covered + effort.step) / total))) is not None:
+            best, covered = better, covered + effort.step
     return best
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dg4d_lib.errors import DG4DError
-from dg4d_lib.mesh.texturing.chart_packing import pack_charts
+from dg4d_lib.mesh.texturing.chart_packing import QUICK, Effort, pack_charts
 from dg4d_lib.mesh.texturing.charts import find_charts
 from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.xatlas_charts import unwrap_with_xatlas
@@ -18,6 +18,7 @@ def unwrap(
     faces: Int[np.ndarray, "f 3"],
     size: int,
     method: UnwrapMethod = "charts",
+    effort: Effort = QUICK,
 ) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]:
     """Unwrap a mesh: compute texture coordinates without overlaps.
 
@@ -26,6 +27,7 @@ def unwrap(
         faces: counter-clockwise seen from outside.
         size: side of the square texture, texels.
         method: charts of this project, or those of xatlas, which may be mirrored.
+        effort: ways of packing that are tried; not for xatlas.
 
     Returns:
         For every new vertex the index of the old one it copies (vertices are split along seams); the faces in their
@@ -40,7 +42,7 @@ def unwrap(
     if method == "xatlas":
         return unwrap_with_xatlas(smooth, faces, size)
     charts = find_charts(vertices, faces, smooth)
-    uvs = pack_charts(charts.flat, charts.faces, charts.labels, size)
+    uvs = pack_charts(charts.flat, charts.faces, charts.labels, size, effort)
     if uvs is None:
         raise DG4DError(
             f"the charts of {len(faces)} faces do not fit into a texture of {size} x {size} texels; "

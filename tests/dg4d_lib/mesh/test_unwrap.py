@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dg4d_lib.errors import DG4DError
+from dg4d_lib.mesh.texturing.chart_packing import THOROUGH
 from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.unwrap import SMOOTHING, unwrap
 
@@ -82,6 +83,13 @@ def test_charts_keep_two_texels_apart(flat: tuple[np.ndarray, ...]) -> None:
 def test_the_same_mesh_is_unwrapped_the_same(torus: Mesh, flat: tuple[np.ndarray, ...]) -> None:
     for first, second in zip(flat, unwrap(*torus, SIZE), strict=True):
         assert first.tobytes() == second.tobytes()
+
+
+def test_more_effort_covers_more_of_the_texture_and_overlaps_nothing(torus: Mesh, flat: tuple[np.ndarray, ...]) -> None:
+    _, faces, uvs = unwrap(*torus, SIZE, effort=THOROUGH)
+    areas = [-np.linalg.det(found[faces[:, 1:]] - found[faces[:, :1]]).sum() / 2 for found in (flat[2], uvs)]
+    assert areas[1] >= areas[0] + 0.01
+    assert (drawn(faces, uvs)[0] <= 1).all()
 
 
 def test_a_texture_without_room_is_refused(torus: Mesh) -> None:
