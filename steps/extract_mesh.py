@@ -118,18 +118,19 @@ def run(job: Job) -> StepReport:
     frames, weights = len(states.means), {}
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
-        job.progress(1, 3, {})
+        stages = 3 + len(plan.rivals)
+        job.progress(1, stages, {})
         guesses = None
         if settings.source == "prior" and video and "subject" in job.inputs:
             guesses = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
             weights = packaged.digests()
         rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses)
         if video and plan.guide == "video":
-            tracked, ious, notes = _guided(rest_shape, states, video, plan, rasterize, settings, job.seed)
+            tracked, ious, notes = _guided(job, rest_shape, states, video, plan, rasterize, settings)
         else:
             rest = rest_shape(plan.reference_frame)
             tracked, ious, notes = _tracked(rest, states, displacement, plan, rasterize, settings, video)
-        job.progress(2, 3, {})
+        job.progress(stages - 1, stages, {})
         write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
         kind = "isosurface of the Gaussians" if guesses is None else "shape network's surface"
@@ -226,23 +227,22 @@ def _tracked(
 
 
 def _guided(
+    job: Job,
     rest_shape: Callable[[int], RestShape],
     states: Gaussians,
     video: DrivingVideo,
     plan: MeshPlan,
     rasterize: Rasterizer,
     settings: MeshSettings,
-    seed: int,
 ) -> tuple[TrackedMesh, Float[Tensor, " t"], list[str]]:
     """Return the mesh that follows the driving video, with colors from it, the IoU of its outlines, and notes.
 
     Where the plan names several frames, each of their surfaces follows the video; the one that shows it best stays.
     """
-    level = plan.level
-    candidates = [
-        _follow(frame, rest_shape(frame), states, video, level, rasterize, settings, seed)
-        for frame in (plan.reference_frame, *plan.rivals)
-    ]
+    level, candidates = plan.level, []
+    for frame in (plan.reference_frame, *plan.rivals):
+        candidates.append(_follow(frame, rest_shape(frame), states, video, level, rasterize, settings, job.seed))
+        job.progress(1 + len(candidates), 3 + len(plan.rivals), {})
     best = max(candidates, key=lambda candidate: candidate.psnr)
     vertices, faces, sources = best.rest.vertices, best.rest.faces, best.sources
     refined = refine_tracking(
