@@ -28,17 +28,18 @@ class Effort(NamedTuple):
     """How many ways of packing are tried.
 
     Attributes:
-        turns: rotations of a chart.
+        turns: rotations of a chart, numbers that the orders take in turn; the largest is a multiple of the others. More
+            are not always better, for a chart takes the lowest place without regard to those that follow.
         orders: of the charts: the first by area, the others disturbed.
         step: increments of the share of the texture that the charts cover.
     """
 
-    turns: int
+    turns: tuple[int, ...]
     orders: int
     step: float
 
 
-QUICK, THOROUGH = Effort(8, 8, 0.01), Effort(16, 48, 0.005)  # a tenth of a second to one, and one to three
+QUICK, THOROUGH = Effort((8,), 8, 0.01), Effort((8, 16), 48, 0.005)  # less than a second, and one to three
 
 
 def pack_charts(
@@ -64,8 +65,8 @@ def pack_charts(
     gap = -(-GAP * grid // size)  # cells
     order = np.argsort(labels, kind="stable")
     members = np.split(faces[order], np.flatnonzero(np.diff(labels[order])) + 1)
-    turns = int(np.clip(MOST_SHAPES // len(members), 1, effort.turns))
-    best = _place_all([_Chart(flat, part, turns, gap) for part in members], grid, gap, effort)
+    most = int(np.clip(MOST_SHAPES // len(members), 1, max(effort.turns)))
+    best = _place_all([_Chart(flat, part, most, gap) for part in members], grid, gap, effort)
     if best is None:
         return None
     uvs = np.zeros(flat.shape)
@@ -125,27 +126,28 @@ def _place_all(charts: list[_Chart], grid: int, gap: int, effort: Effort) -> Pla
     total, areas = sum(chart.area for chart in charts), np.array([chart.area for chart in charts])
     generator = np.random.default_rng(0)
     best, covered = None, FIRST_COVERAGE
-    for _ in range(effort.orders if len(charts) <= MOST_SHAPES else 1):
+    for turn in range(effort.orders if len(charts) <= MOST_SHAPES else 1):
+        every = max(effort.turns) // effort.turns[turn % len(effort.turns)]
         noise = generator.normal(size=len(charts)) * (DISTURBANCE if best is not None else 0)
         order = [charts[index] for index in np.argsort(noise - np.log(areas), kind="stable")]
         while best is None and covered > LEAST_COVERAGE:
-            best = _place(order, grid, gap, grid * np.sqrt(covered / total))
+            best = _place(order, grid, gap, grid * np.sqrt(covered / total), every)
             covered = covered if best is not None else 0.95 * covered
         if best is None:
             return None
-        while (better := _place(order, grid, gap, grid * np.sqrt((covered + effort.step) / total))) is not None:
+        while (better := _place(order, grid, gap, grid * np.sqrt((covered + effort.step) / total), every)) is not None:
             best, covered = better, covered + effort.step
     return best
 
 
-def _place(charts: list[_Chart], grid: int, gap: int, scale: float) -> Placed | None:
-    """Place charts one after the other at a scale; None if one finds no place."""
+def _place(charts: list[_Chart], grid: int, gap: int, scale: float, every: int) -> Placed | None:
+    """Place charts one after the other at a scale, in every n-th of their turns; None if one finds no place."""
     taken = np.zeros((grid + 2 * gap, grid + 2 * gap), np.bool_)  # charts may touch the border of the texture
     next_free = np.tile(np.arange(grid + 2 * gap), (grid + 2 * gap, 1))
     placed: Placed = []
     for chart in charts:
         lowest: tuple[float, int, int, _Shape] | None = None
-        for shape in chart.shapes(scale):
+        for shape in chart.shapes(scale)[::every]:
             last = grid - shape.height
             if lowest is not None:
                 last = min(last, int(lowest[0] - shape.center))
