@@ -19,7 +19,7 @@ from rich.table import Table
 
 from benchmarks.peers import WHITE
 from benchmarks.rasterizer import bumpy_ball, draw, draw_peer, ring
-from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
+from dg4d_lib.cameras.orbit import OrbitCamera, intrinsics, viewmats
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import BLUR, NEAR, get_rasterizer
 
@@ -49,18 +49,17 @@ def bare_gsplat(cloud: Gaussians, cameras: list[OrbitCamera]) -> Callable[[], tu
     size, count = cameras[0].width, len(cameras)
     states = cloud.means.ndim == 3
     poses = viewmats(cameras).float().cuda()
-    intrinsics = torch.tensor([[c.focal, 0, size / 2, 0, c.focal, size / 2, 0, 0, 1] for c in cameras])
-    intrinsics = intrinsics.reshape(count, 3, 3).cuda()
+    lenses = intrinsics(cameras).cuda()
     white = WHITE.cuda().expand(count, 3)
     if states:
-        poses, intrinsics, white = poses[:, None], intrinsics[:, None], white[:, None]
+        poses, lenses, white = poses[:, None], lenses[:, None], white[:, None]
 
     def render() -> tuple[torch.Tensor, torch.Tensor]:
         opacities, colors = cloud.opacities, cloud.colors
         if states:
             opacities, colors = opacities.expand(count, -1), colors.expand(count, -1, -1)
         pictures, alpha, _ = rasterization(
-            cloud.means, cloud.quats, cloud.scales, opacities, colors, poses, intrinsics, size, size,
+            cloud.means, cloud.quats, cloud.scales, opacities, colors, poses, lenses, size, size,
             near_plane=NEAR, eps2d=BLUR, backgrounds=white, render_mode="RGB+D", packed=False,
         )  # fmt: skip
         return pictures, alpha

@@ -12,7 +12,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import OrbitCamera, intrinsics
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import MAX_ALPHA, MAX_SIGMA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
 
@@ -32,7 +32,7 @@ def gsplat_torch(cloud: Gaussians, camera: OrbitCamera) -> Callable[[], tuple[Te
     gsplat: Any = importlib.import_module("gsplat.cuda._torch_impl")
     width, height = camera.width, camera.height
     pose = camera.viewmat().float()[None]
-    lens = torch.tensor([[[camera.focal, 0, width / 2], [0, camera.focal, height / 2], [0, 0, 1]]])
+    lens = intrinsics([camera])
     nerfacc, behind = _nerfacc(), torch.cat((WHITE, torch.zeros(1)))
 
     def draw() -> tuple[Tensor, Tensor]:

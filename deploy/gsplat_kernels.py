@@ -1,4 +1,4 @@
-"""Compiles gsplat's CUDA kernels into the installed package, as `gsplat.csrc`, which it looks for first.
+"""Compilation of gsplat's CUDA kernels into the installed package, as `gsplat.csrc`, which it looks for first.
 
     python deploy/gsplat_kernels.py
 
@@ -14,6 +14,8 @@ from importlib.metadata import PackageNotFoundError, files, version
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
+
+import torch
 
 STAMP = "csrc.txt"  # beside the kernels: what they were compiled for
 COMPILER = "nvidia-cuda-nvcc"
@@ -55,8 +57,6 @@ def main() -> int:
 
 def architectures() -> Sequence[str]:
     """Return the GPU architectures to compile for, without repetition."""
-    import torch  # noqa: PLC0415 - after $CUDA_HOME is known
-
     if given := os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split():
         return given
     count = torch.cuda.device_count()

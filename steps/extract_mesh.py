@@ -118,7 +118,7 @@ def run(job: Job) -> StepReport:
     frames, weights = len(states.means), {}
     video = _driving_video(job, frames)
     if plan.mode == "tracked":
-        stages = 3 + len(plan.rivals)
+        stages = 3 + len(plan.other_candidates)
         job.progress(1, stages, {})
         guesses = None
         if settings.source == "prior" and video and "subject" in job.inputs:
@@ -240,9 +240,9 @@ def _guided(
     Where the plan names several frames, each of their surfaces follows the video; the one that shows it best stays.
     """
     level, candidates = plan.level, []
-    for frame in (plan.reference_frame, *plan.rivals):
+    for frame in (plan.reference_frame, *plan.other_candidates):
         candidates.append(_follow(frame, rest_shape(frame), states, video, level, rasterize, settings, job.seed))
-        job.progress(1 + len(candidates), 3 + len(plan.rivals), {})
+        job.progress(1 + len(candidates), 3 + len(plan.other_candidates), {})
     best = max(candidates, key=lambda candidate: candidate.psnr)
     vertices, faces, sources = best.rest.vertices, best.rest.faces, best.sources
     refined = refine_tracking(
@@ -257,7 +257,7 @@ def _guided(
     mesh = _fitted(replace(best.mesh, texture=texture), moved, faces, sources, video)
     tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=best.frame)
     notes = [f"a trial mesh of frame {plan.reference_frame} had {plan.followed:.1%} IoU"]
-    if plan.rivals:
+    if plan.other_candidates:
         scores = ", ".join(f"frame {candidate.frame} {candidate.psnr:.1f} dB" for candidate in candidates)
         notes.append(f"tracked in full, before the last registration: {scores} (PSNR at the input view)")
     return tracked, silhouette_iou(moved, faces, silhouettes), notes
@@ -281,8 +281,7 @@ def _follow(
     mesh, sources = _colored(
         vertices, faces, rest.draw, settings, lambda sources: _footage(moved, faces, sources, video)
     )  # fmt: skip
-    shown = _footage(moved, faces, sources, video)
-    errors = [_squared_error(replace(mesh, vertices=surface.vertices), surface) for surface in shown]
+    errors = _squared_errors(mesh, _footage(moved, faces, sources, video))
     psnr = sum(-10 * math.log10(max(error, LEAST_ERROR)) for error in errors) / len(errors)
     return Candidate(frame, rest, offsets, mesh, sources, psnr)
 
@@ -316,17 +315,20 @@ def _footage(
     surfaces = [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
     if textured is None:
         return surfaces
-    errors = [_squared_error(replace(textured, vertices=surface.vertices), surface) for surface in surfaces]
+    errors = _squared_errors(textured, surfaces)
     least = max(min(errors), LEAST_ERROR)
     weights = [(least / max(error, least)) ** selectivity for error in errors]
     return [replace(surface, weight=weight) for surface, weight in zip(surfaces, weights, strict=True)]
 
 
-def _squared_error(mesh: TexturedMesh, surface: PosedSurface) -> float:
-    """Return the mean squared error of a render from the input camera against a frame, over white."""
-    camera = OrbitCamera(width=surface.color.shape[1], height=surface.color.shape[0])
-    rendered = color_over_white(*render_mesh(mesh, [camera]))[0]
-    return float((rendered - color_over_white(surface.color, surface.alpha)).square().mean())
+def _squared_errors(mesh: TexturedMesh, surfaces: list[PosedSurface]) -> list[float]:
+    """Return the mean squared errors of renders from the input camera against frames of the video, over white."""
+    errors = []
+    for surface in surfaces:
+        camera = OrbitCamera(width=surface.color.shape[1], height=surface.color.shape[0])
+        rendered = color_over_white(*render_mesh(replace(mesh, vertices=surface.vertices), [camera]))[0]
+        errors.append(float((rendered - color_over_white(surface.color, surface.alpha)).square().mean()))
+    return errors
 
 
 def _at(video: DrivingVideo | None, frame: int) -> Frame | None:

@@ -36,7 +36,7 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
-    rivals: tuple[int, ...] = ()
+    others: tuple[int, ...] = ()
     guide: Literal["gaussians", "video"] = "gaussians"
     weights: dict[str, str] = {}
     if mode != "per_frame":
@@ -55,7 +55,7 @@ def run(job: Job) -> StepReport:
                 ranked = rank()
             if mode == "tracked" or ranked[0][1] >= settings.min_guided or followed < settings.min_followed:
                 (frame, followed), guide = ranked[0], "video"
-                rivals = tuple(other for other, _ in ranked[1:])
+                others = tuple(other for other, _ in ranked[1:])
     if mode == "auto":
         least = settings.min_followed if guide == "gaussians" else settings.min_guided
         mode = "tracked" if followed >= least else "per_frame"
@@ -64,7 +64,7 @@ def run(job: Job) -> StepReport:
                 f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.{LIMITS[guide]} asks for "
                 f"{least:.0%}): every frame gets its own"
             )
-            frame, guide, rivals = 0, "gaussians", ()
+            frame, guide, others = 0, "gaussians", ()
     job.progress(1, 2, {})
     rest = states.at(frame)
     level, agreement = select_level(density_field(rest, settings), rest, rasterize, settings.density_threshold)
@@ -78,7 +78,13 @@ def run(job: Job) -> StepReport:
             )
     notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
     plan = MeshPlan(
-        mode=mode, reference_frame=frame, rivals=rivals, followed=followed, level=level, grid=grid, guide=guide
+        mode=mode,
+        reference_frame=frame,
+        other_candidates=others,
+        followed=followed,
+        level=level,
+        grid=grid,
+        guide=guide,
     )
     write_plan(job.outputs["plan"], plan)
     job.progress(2, 2, {})

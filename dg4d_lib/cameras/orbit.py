@@ -64,6 +64,16 @@ class OrbitCamera:
         return torch.tensor(rows, dtype=torch.float64)
 
 
+def intrinsics(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
+    """Return the intrinsic matrices, gsplat's `Ks`: focal lengths and principal points, pixels."""
+    return torch.tensor(
+        [
+            ((camera.focal, 0, camera.width / 2), (0, camera.focal, camera.height / 2), (0, 0, 1))
+            for camera in cameras
+        ]
+    )  # fmt: skip
+
+
 def viewmats(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 4 4"]:
     """Stack the world-to-camera matrices of several cameras, float64."""
     return torch.stack([camera.viewmat() for camera in cameras])

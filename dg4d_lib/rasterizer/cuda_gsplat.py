@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.utils.cpp_extension import get_default_build_root
 
-from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
+from dg4d_lib.cameras.orbit import OrbitCamera, intrinsics, viewmats
 from dg4d_lib.devices import to_device_async
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -71,7 +71,7 @@ def rasterize(
     if means2d_offsets is not None:
         means = _Grad2d.apply(means, means2d_offsets, grad2d)
     poses = to_device_async(viewmats(cameras).float(), DEVICE)
-    Ks = to_device_async(_intrinsics(cameras), DEVICE)
+    Ks = to_device_async(intrinsics(cameras), DEVICE)
     backgrounds = to_device_async(background.detach().float(), DEVICE).expand(len(cameras), 3)
     if per_camera:  # a batch of clouds with one camera each
         opacities, colors = opacities.expand(len(cameras), -1), colors.expand(len(cameras), -1, -1)
@@ -122,16 +122,6 @@ def _one_by_one(
         offsets = None if means2d_offsets is None else means2d_offsets[view : view + 1]
         views.append(vars(rasterize(gaussians.at(view), [camera], background, offsets)).values())
     return Rendering(*(torch.cat(parts) for parts in zip(*views, strict=True)))
-
-
-def _intrinsics(cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b 3 3"]:
-    """Return gsplat's `Ks`: focal lengths and principal points, pixels."""
-    return torch.tensor(
-        [
-            ((camera.focal, 0, camera.width / 2), (0, camera.focal, camera.height / 2), (0, 0, 1))
-            for camera in cameras
-        ]
-    )  # fmt: skip
 
 
 class _Grad2d(torch.autograd.Function):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, NonNegativeInt, ValidationError
 
 from dg4d_lib.errors import BadInput
 from steps.contract import Frozen
@@ -14,7 +14,7 @@ class MeshPlan(Frozen):
 
     mode: Literal["tracked", "per_frame"]
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
-    rivals: tuple[int, ...] = Field((), description="other frames that are tracked in full before one is chosen")
+    other_candidates: tuple[NonNegativeInt, ...] = Field((), description="frames that are tracked in full, too")
     followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 if none")
     level: float = Field(description="density of the surface")
     grid: int | None = Field(None, ge=16, le=512, description="cells of the density field per axis; none: `mesh.grid`")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -46,8 +47,8 @@ def toolkit(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 
 
 @pytest.fixture
-def compiled(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[dict[str, object]]:
-    """What was given to the compiler; g++ and an installed gsplat are there."""
+def compiled(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[dict[str, Any]]:
+    """Record the calls of the compiler; g++ and gsplat count as installed."""
     package = tmp_path / "gsplat"
     for name in ("__init__.py", "cuda/ext.cpp", "cuda/csrc/Projection.cu", "cuda/csrc/Tiles.cpp"):
         (package / name).parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +56,7 @@ def compiled(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "g++").write_text("#!/bin/sh\n")
     (tmp_path / "bin" / "g++").chmod(0o755)
-    calls: list[dict[str, object]] = []
+    calls: list[dict[str, Any]] = []
 
     def load(**given: object) -> None:
         calls.append(given)
@@ -113,7 +114,7 @@ def without_cxx(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_is_missing_is_named(
     take_away: Callable[[ModuleType, pytest.MonkeyPatch], None], named: str, script: ModuleType,
-    compiled: list[dict[str, object]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    compiled: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
     take_away(script, monkeypatch)
@@ -123,13 +124,13 @@ def test_what_is_missing_is_named(
 
 
 def test_kernels_are_compiled_once_for_every_set_of_gpus(
-    script: ModuleType, compiled: list[dict[str, object]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: ModuleType, compiled: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: [(9, 0), (8, 6), (9, 0)][index])
     assert script.main() == 0
     (given,) = compiled
-    names = [Path(path).name for path in given["sources"]]  # type: ignore[attr-defined]
+    names = [Path(path).name for path in given["sources"]]
     assert names == ["Projection.cu", "Tiles.cpp", "ext.cpp"]
     assert given["name"] == "csrc"
     assert os.environ["TORCH_CUDA_ARCH_LIST"] == "8.6 9.0"

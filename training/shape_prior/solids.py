@@ -20,7 +20,7 @@ UNION, CARVE, PAINT = range(3)
 PARAMETERS = 8  # numbers of a primitive beside its frame and half sizes
 COLUMNS = 3 + 9 + 3 + PARAMETERS + 1  # center, axes, half sizes, parameters, blend radius
 
-_MIRROR = np.array([-1.0, 1.0, 1.0])
+MIRROR = np.array([-1.0, 1.0, 1.0])
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 _SPREAD = np.concatenate([_CORNERS / math.sqrt(3), np.eye(3), -np.eye(3)])
 
@@ -51,7 +51,7 @@ class Solid:
 
     def mirrored(self) -> "Solid":
         """Return the mirror image in the plane x = 0."""
-        return replace(self, center=self.center * _MIRROR, axes=self.axes * _MIRROR)
+        return replace(self, center=self.center * MIRROR, axes=self.axes * MIRROR)
 
     def outline_points(self) -> Float64[np.ndarray, "n 3"]:
         """Return points on the surface, or on the box around it, from which extents are measured."""

@@ -1,4 +1,4 @@
-"""Variety beyond the recipes: bodies grown, bent and twisted by a smooth displacement, and things attached to them."""
+"""Random deformation of made-up shapes by a smooth displacement field, and attachment of small things."""
 
 import math
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from training.shape_prior.solids import (
     CARVE,
     CONE,
     CYLINDER,
+    MIRROR,
     PLATE,
     SHELL,
     TORUS,
@@ -26,7 +27,6 @@ from training.shape_prior.solids import (
     scaled,
 )
 
-MIRROR = np.diag([-1.0, 1.0, 1.0])
 LEAST, MOST = 0.45, 2.2  # stretch of a solid along any of its axes
 STEP = 1e-3  # of numerical derivatives, object units
 
@@ -77,7 +77,7 @@ def random_warp(chance: Chance, shape: Shape) -> Warp:
             reach = chance.between(0.25, 0.7) * extent
             bumps.append((center, reach, growth))
             if shape.symmetric:
-                bumps.append((MIRROR @ center, reach, MIRROR @ growth @ MIRROR))
+                bumps.append((MIRROR * center, reach, MIRROR[:, None] * growth * MIRROR))
     centers, reaches, growths = zip(*bumps, strict=True) if bumps else ((), (), ())
     return Warp(stretch, np.reshape(centers, (-1, 3)), np.array(reaches, float), np.reshape(growths, (-1, 3, 3)))
 

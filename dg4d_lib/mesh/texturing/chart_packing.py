@@ -25,7 +25,7 @@ Placed = list[tuple[NDArray[np.int64], Array]]  # vertices of every chart and th
 
 
 class Effort(NamedTuple):
-    """How many ways of packing are tried.
+    """Numbers of rotations and orders that a packing tries.
 
     Attributes:
         turns: rotations of a chart, numbers that the orders take in turn; the largest is a multiple of the others. More
@@ -127,27 +127,27 @@ def _place_all(charts: list[_Chart], grid: int, gap: int, effort: Effort) -> Pla
     generator = np.random.default_rng(0)
     best, covered = None, FIRST_COVERAGE
     for turn in range(effort.orders if len(charts) <= MOST_SHAPES else 1):
-        every = max(effort.turns) // effort.turns[turn % len(effort.turns)]
+        stride = max(effort.turns) // effort.turns[turn % len(effort.turns)]
         noise = generator.normal(size=len(charts)) * (DISTURBANCE if best is not None else 0)
         order = [charts[index] for index in np.argsort(noise - np.log(areas), kind="stable")]
         while best is None and covered > LEAST_COVERAGE:
-            best = _place(order, grid, gap, grid * np.sqrt(covered / total), every)
+            best = _place(order, grid, gap, grid * np.sqrt(covered / total), stride)
             covered = covered if best is not None else 0.95 * covered
         if best is None:
             return None
-        while (better := _place(order, grid, gap, grid * np.sqrt((covered + effort.step) / total), every)) is not None:
+        while (better := _place(order, grid, gap, grid * np.sqrt((covered + effort.step) / total), stride)) is not None:
             best, covered = better, covered + effort.step
     return best
 
 
-def _place(charts: list[_Chart], grid: int, gap: int, scale: float, every: int) -> Placed | None:
-    """Place charts one after the other at a scale, in every n-th of their turns; None if one finds no place."""
+def _place(charts: list[_Chart], grid: int, gap: int, scale: float, stride: int) -> Placed | None:
+    """Place charts one after the other at a scale, in every `stride`-th of their turns; None if one finds no place."""
     taken = np.zeros((grid + 2 * gap, grid + 2 * gap), np.bool_)  # charts may touch the border of the texture
     next_free = np.tile(np.arange(grid + 2 * gap), (grid + 2 * gap, 1))
     placed: Placed = []
     for chart in charts:
         lowest: tuple[float, int, int, _Shape] | None = None
-        for shape in chart.shapes(scale)[::every]:
+        for shape in chart.shapes(scale)[::stride]:
             last = grid - shape.height
             if lowest is not None:
                 last = min(last, int(lowest[0] - shape.center))

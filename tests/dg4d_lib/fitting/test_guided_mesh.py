@@ -153,7 +153,7 @@ def test_a_handle_outweighs_a_trial_that_is_a_little_better(
 
 
 @pytest.mark.parametrize(("scores", "frames"), [((0.95, 0.93, 0.94), [0, 4]), ((0.95, 0.91, 0.90), [0])])
-def test_rivals_are_about_as_good_as_the_best(
+def test_ranked_frames_are_about_as_good_as_the_best(
     monkeypatch: pytest.MonkeyPatch, scores: tuple[float, ...], frames: list[int]
 ) -> None:
     overlaps = iter(scores)
