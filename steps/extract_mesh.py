@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
+from dg4d_lib.fitting.tracking_order import is_loop
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.guidance.interface import SubjectShapes
@@ -41,6 +42,7 @@ from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
+from dg4d_lib.mesh.tracking.separation import separate
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -217,12 +219,13 @@ def _tracked(
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
-        offsets = turn_back(vertices, relax(vertices, registered, faces, silhouettes), faces, silhouettes)
+        relaxed = relax(vertices, registered, faces, silhouettes)
+        offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
         ious = silhouette_iou(vertices + offsets, faces, silhouettes)
         mesh, sources = coloring.result()
     if video is not None:
         mesh = _fitted(mesh, vertices + offsets, faces, sources, video)
-    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU"]
+    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
 
@@ -249,7 +252,7 @@ def _guided(
         best.mesh, sources, vertices, best.offsets, faces, states, video, level, rasterize, settings
     )  # fmt: skip
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
-    refined = turn_back(vertices, refined, faces, silhouettes)
+    refined, separated = _sound(vertices, refined, faces, silhouettes, video)
     moved = vertices + refined
     normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, best.mesh)
     draw = best.rest.draw
@@ -260,7 +263,20 @@ def _guided(
     if plan.other_candidates:
         scores = ", ".join(f"frame {candidate.frame} {candidate.psnr:.1f} dB" for candidate in candidates)
         notes.append(f"tracked in full, before the last registration: {scores} (PSNR at the input view)")
-    return tracked, silhouette_iou(moved, faces, silhouettes), notes
+    return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *separated]
+
+
+def _sound(
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    silhouettes: Bool[Tensor, "t k h w"],
+    video: DrivingVideo | None,
+) -> tuple[Float[Tensor, "t v 3"], list[str]]:
+    """Return offsets with fewer crossings and flipped faces, and a note if there were crossings."""
+    separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
+    note = f"parts that had sunk into each other in {frames} frames were moved apart, as far as outlines allow"
+    return turn_back(vertices, separated, faces, silhouettes), [note] if frames else []
 
 
 def _follow(

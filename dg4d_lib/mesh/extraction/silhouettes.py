@@ -50,15 +50,16 @@ def silhouette_iou(
     Args:
         vertices: of the mesh at m frames, world units.
         faces: indices into the vertices.
-        silhouettes: output of `render_silhouettes` for these frames.
+        silhouettes: output of `render_silhouettes` for these frames, or its first views.
     """
-    total = torch.zeros(len(vertices))
-    for view, cameras in enumerate(cameras_of(len(vertices))):
+    total, weights = torch.zeros(len(vertices)), 0.0
+    for view, cameras in enumerate(cameras_of(len(vertices))[: silhouettes.shape[1]]):
         rendered = rasterize_mesh(vertices, faces, cameras).faces >= 0
         expected = silhouettes[:, view]
         intersection, union = (mask.flatten(1).sum(1) for mask in (rendered & expected, rendered | expected))
         total += VIEWS[view][1] * (intersection / union.clamp(min=1)).cpu()
-    return total / sum(weight for _, weight in VIEWS)
+        weights += VIEWS[view][1]
+    return total / weights
 
 
 def cameras_of(frames: int) -> list[list[OrbitCamera]]:

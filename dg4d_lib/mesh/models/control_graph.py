@@ -96,7 +96,7 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
     """
     chosen, spacing = spread_nodes(graph, points, min(count, len(points)))
     nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(chosen))
-    distances = _distances(graph, chosen, REACH * spacing).astype(np.float32)  # m v
+    distances = graph_distances(graph, chosen, REACH * spacing).astype(np.float32)  # m v
     distances = np.minimum(distances, REACH * spacing)
     order = np.argpartition(distances, nearest - 1, axis=0)[:nearest].T
     near = np.take_along_axis(distances.T, order, 1)
@@ -193,17 +193,17 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
 def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> tuple[Int[np.ndarray, " m"], float]:
     """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    nearest = _distances(graph, chosen[:1])[0]
+    nearest = graph_distances(graph, chosen[:1])[0]
     while len(chosen) < count:
         chosen.append(int(nearest.argmax()))
         if nearest[chosen[-1]] == 0:
             chosen.pop()
             break
-        nearest = np.minimum(nearest, _distances(graph, chosen[-1:], float(nearest[chosen[-1]]))[0])
+        nearest = np.minimum(nearest, graph_distances(graph, chosen[-1:], float(nearest[chosen[-1]]))[0])
     return np.array(chosen), max(float(nearest.max()), 1e-9)
 
 
-def _distances(
+def graph_distances(
     graph: csr_array, sources: Sequence[int] | Int[np.ndarray, " m"], limit: float = np.inf
 ) -> Float[np.ndarray, "m v"]:
     """Return the distances from some points to all along the graph; infinity beyond the limit."""
