@@ -169,8 +169,8 @@ def self_intersecting(
     marked = np.zeros(len(corners), np.bool_)
     if len(corners) == 0:
         return marked
-    boxes = points[corners]
-    low, high = boxes.min(1), boxes.max(1)
+    a, b, c = points[corners[:, 0]], points[corners[:, 1]], points[corners[:, 2]]
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)  # four times as fast as along an axis
     extent = float((high.max(0) - low.min(0)).max())
     cell = max(2 * float((high - low).mean()), extent / LONGEST_CELLS, 1e-300)
     first = ((low - low.min(0)) / cell).astype(np.int64)

@@ -147,13 +147,10 @@ def push_apart(balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: boo
     fewest, best, waited = np.inf, moved, 0
     for _ in range(ROUNDS):
         present, centers = shifts.apply()
-        crossing = [self_intersecting(frame, balls.body.faces) for frame in present]
-        count = sum(int(faces.sum()) for faces in crossing)
+        count, found, pushes = _search(balls, present, centers)
         fewest, best, waited = (count, present, 0) if count < fewest else (fewest, best, waited + 1)
         if count == 0 or waited == PATIENCE:
             break
-        found = [balls.submerged(*frame) for frame in zip(present, centers, crossing, strict=True)]
-        pushes = np.stack([_pushes(balls, *frame) for frame in zip(found, present, centers, strict=True)])
         steady = gaussian_filter1d(pushes, STEADY, axis=0, mode="wrap" if loop else "nearest")
         known = np.linalg.norm(steady, axis=2, keepdims=True) > 0
         directions = np.where(known, steady, directions)
@@ -164,6 +161,23 @@ def push_apart(balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: boo
         if not shifts.solve(contacts, present, centers):
             break
     return best
+
+
+def _search(
+    balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], centers: Float64[np.ndarray, "t b 3"]
+) -> tuple[int, list[Submerged], Float64[np.ndarray, "t m 3"]]:
+    """Return the number of crossing faces over all frames, what is submerged at each, and `_pushes` of each."""
+    counts, found = np.zeros(len(moved), np.int64), dict[int, Submerged]()
+    pushes = np.zeros((len(moved), len(balls.control.nodes), 3))
+
+    def search(frame: int) -> None:
+        crossing = self_intersecting(moved[frame], balls.body.faces)
+        counts[frame] = crossing.sum()
+        found[frame] = balls.submerged(moved[frame], centers[frame], crossing)
+        pushes[frame] = _pushes(balls, found[frame], moved[frame], centers[frame])
+
+    run_parallel([partial(search, frame) for frame in range(len(moved))])
+    return int(counts.sum()), [found[frame] for frame in range(len(moved))], pushes
 
 
 def _crossings(moved: Float64[np.ndarray, "t v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " t"]:
