@@ -17,7 +17,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking
+from dg4d_lib.fitting.guided_mesh import follow_video, refine_tracking, register_tracking
 from dg4d_lib.fitting.tracking_order import is_loop
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
@@ -92,17 +92,11 @@ class Candidate(NamedTuple):
         frame: of the surface.
         rest: the surface.
         offsets: of its vertices at every frame.
-        mesh: textured from the video, split along seams.
-        sources: vertex that every split vertex copies.
-        psnr: of its renders against the video, dB.
     """
 
     frame: int
     rest: RestShape
     offsets: Float[Tensor, "t v 3"]
-    mesh: TexturedMesh
-    sources: Int[Tensor, " w"]
-    psnr: float
 
 
 def run(job: Job) -> StepReport:
@@ -240,30 +234,52 @@ def _guided(
 ) -> tuple[TrackedMesh, Float[Tensor, " t"], list[str]]:
     """Return the mesh that follows the driving video, with colors from it, the IoU of its outlines, and notes.
 
-    Where the plan names several frames, each of their surfaces follows the video; the one that shows it best stays.
+    Where the plan names several frames, the surface of each is tracked; the one that shows the video best stays.
     """
     level, candidates = plan.level, []
     for frame in (plan.reference_frame, *plan.other_candidates):
-        candidates.append(_follow(frame, rest_shape(frame), states, video, level, rasterize, settings, job.seed))
+        rest, generator = rest_shape(frame), torch.Generator().manual_seed(job.seed)
+        offsets = follow_video(rest.vertices, rest.faces, states, video, frame, rasterize, generator)
+        candidates.append(Candidate(frame, rest, offsets))
         job.progress(1 + len(candidates), 3 + len(plan.other_candidates), {})
-    best = max(candidates, key=lambda candidate: candidate.psnr)
-    vertices, faces, sources = best.rest.vertices, best.rest.faces, best.sources
-    refined = refine_tracking(
-        best.mesh, sources, vertices, best.offsets, faces, states, video, level, rasterize, settings
+    notes = [f"a trial mesh of frame {plan.reference_frame} had {plan.followed:.1%} IoU"]
+    best = candidates[0]
+    if plan.other_candidates:
+        scores = [_psnr(candidate, settings, video) for candidate in candidates]
+        best = candidates[scores.index(max(scores))]
+        listed = ", ".join(f"frame {one.frame} {score:.1f} dB" for one, score in zip(candidates, scores, strict=True))
+        notes.append(f"tracked, before registration: {listed} (PSNR at the input view)")
+    vertices, faces, draw = best.rest.vertices, best.rest.faces, best.rest.draw
+    offsets = register_tracking(
+        vertices, best.offsets, faces, states, video, best.frame, level, rasterize, settings
     )  # fmt: skip
+    mesh, sources = _colored(
+        vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
+    )  # fmt: skip
+    refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined, separated = _sound(vertices, refined, faces, silhouettes, video)
     moved = vertices + refined
-    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, best.mesh)
-    draw = best.rest.draw
-    texture = bake_texture(best.mesh.vertices, normals, best.mesh.faces, best.mesh.uvs, draw, settings, footage)
-    mesh = _fitted(replace(best.mesh, texture=texture), moved, faces, sources, video)
+    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
+    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, draw, settings, footage)
+    mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
     tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=best.frame)
-    notes = [f"a trial mesh of frame {plan.reference_frame} had {plan.followed:.1%} IoU"]
-    if plan.other_candidates:
-        scores = ", ".join(f"frame {candidate.frame} {candidate.psnr:.1f} dB" for candidate in candidates)
-        notes.append(f"tracked in full, before the last registration: {scores} (PSNR at the input view)")
     return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *separated]
+
+
+def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
+    """Return the PSNR of the candidate's renders against the video, dB, with a texture from there."""
+    moved, faces = candidate.rest.vertices + candidate.offsets, candidate.rest.faces
+    mesh, sources = _colored(
+        candidate.rest.vertices,
+        faces,
+        candidate.rest.draw,
+        settings,
+        lambda sources: _footage(moved, faces, sources, video),
+        QUICK,
+    )
+    errors = _squared_errors(mesh, _footage(moved, faces, sources, video))
+    return sum(-10 * math.log10(max(error, LEAST_ERROR)) for error in errors) / len(errors)
 
 
 def _sound(
@@ -277,29 +293,6 @@ def _sound(
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
     note = f"parts that had sunk into each other in {frames} frames were moved apart, as far as outlines allow"
     return turn_back(vertices, separated, faces, silhouettes), [note] if frames else []
-
-
-def _follow(
-    frame: int,
-    rest: RestShape,
-    states: Gaussians,
-    video: DrivingVideo,
-    level: float,
-    rasterize: Rasterizer,
-    settings: MeshSettings,
-    seed: int,
-) -> Candidate:
-    """Track the surface of one frame through the driving video, and texture it from there."""
-    vertices, faces = rest.vertices, rest.faces
-    generator = torch.Generator().manual_seed(seed)
-    offsets = follow_video(vertices, faces, states, video, frame, level, rasterize, settings, generator)
-    moved = vertices + offsets
-    mesh, sources = _colored(
-        vertices, faces, rest.draw, settings, lambda sources: _footage(moved, faces, sources, video)
-    )  # fmt: skip
-    errors = _squared_errors(mesh, _footage(moved, faces, sources, video))
-    psnr = sum(-10 * math.log10(max(error, LEAST_ERROR)) for error in errors) / len(errors)
-    return Candidate(frame, rest, offsets, mesh, sources, psnr)
 
 
 def _fitted(

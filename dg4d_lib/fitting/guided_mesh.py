@@ -45,12 +45,10 @@ def follow_video(
     states: Gaussians,
     video: DrivingVideo,
     reference_frame: int,
-    level: float,
     rasterize: Rasterizer,
-    settings: MeshSettings,
     generator: torch.Generator,
 ) -> Float[Tensor, "t v 3"]:
-    """Return the offsets by which the surface of one frame follows the driving video.
+    """Return the offsets by which the surface of one frame follows the driving video, before any registration.
 
     A surface that loses the outline is tracked a second time, with limbs that swing.
 
@@ -60,9 +58,7 @@ def follow_video(
         states: the cloud at every frame (fields "t n 3").
         video: of the camera at azimuth and elevation 0.
         reference_frame: frame that the surface was extracted from.
-        level: density of the surface.
         rasterize: the splatting backend.
-        settings: mesh settings.
         generator: draws the frames of joint iterations.
 
     Raises:
@@ -79,17 +75,36 @@ def follow_video(
     if overlap < LOST:
         second, other = track(swinging(TRACKING))
         moved = other if swinging_is_better(overlap, second) else moved
+    return moved - vertices
+
+
+def register_tracking(
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    states: Gaussians,
+    video: DrivingVideo,
+    reference_frame: int,
+    level: float,
+    rasterize: Rasterizer,
+    settings: MeshSettings,
+) -> Float[Tensor, "t v 3"]:
+    """Return the offsets of `follow_video`, registered to the outlines of the video, from frame to frame.
+
+    Args:
+        vertices: surface of the reference frame, not split along seams.
+        offsets: of the vertices at every frame.
+        faces: counter-clockwise seen from outside.
+        states: the cloud at every frame (fields "t n 3").
+        video: of the camera at azimuth and elevation 0.
+        reference_frame: frame that the surface was extracted from.
+        level: density of the surface.
+        rasterize: the splatting backend.
+        settings: mesh settings.
+    """
+    orders, alpha = tracking_orders(video, reference_frame), video.alpha[..., 0]
     return register_to_outlines(
-        vertices,
-        moved - vertices,
-        faces,
-        states,
-        video.alpha[..., 0],
-        level,
-        rasterize,
-        settings,
-        orders=tracking_orders(video, reference_frame),
-        loop=is_loop(video),
+        vertices, offsets, faces, states, alpha, level, rasterize, settings, orders=orders, loop=is_loop(video)
     )
 
 
@@ -105,7 +120,7 @@ def refine_tracking(
     rasterize: Rasterizer,
     settings: MeshSettings,
 ) -> Float[Tensor, "t v 3"]:
-    """Return the offsets of `follow_video`, registered to the colors of the video and to its outlines again.
+    """Return the offsets of `register_tracking`, registered to the colors of the video and to its outlines again.
 
     Args:
         mesh: textured, split along seams.

@@ -14,7 +14,7 @@ class MeshPlan(Frozen):
 
     mode: Literal["tracked", "per_frame"]
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
-    other_candidates: tuple[NonNegativeInt, ...] = Field((), description="frames that are tracked in full, too")
+    other_candidates: tuple[NonNegativeInt, ...] = Field((), description="frames whose surfaces are tracked, too")
     followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 if none")
     level: float = Field(description="density of the surface")
     grid: int | None = Field(None, ge=16, le=512, description="cells of the density field per axis; none: `mesh.grid`")

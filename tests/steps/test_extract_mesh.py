@@ -229,7 +229,7 @@ def test_of_two_frames_the_one_whose_mesh_shows_the_video_stays(
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     assert read_plan(tmp_path / "plan").other_candidates == (0,)
     assert read_tracked(tmp_path / "tracked").reference_frame == 0
-    (compared,) = [note for note in facts.notes if note.startswith("tracked in full")]
+    (compared,) = [note for note in facts.notes if note.startswith("tracked, before registration")]
     worse, better = map(float, re.findall(r"frame \d ([\d.]+) dB", compared))
     assert worse < better - 3
 

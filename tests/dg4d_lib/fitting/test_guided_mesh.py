@@ -8,7 +8,12 @@ import trimesh
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting import guided_mesh
-from dg4d_lib.fitting.guided_mesh import follow_video, frames_with_long_outlines, rank_guided_references
+from dg4d_lib.fitting.guided_mesh import (
+    follow_video,
+    frames_with_long_outlines,
+    rank_guided_references,
+    register_tracking,
+)
 from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
@@ -87,7 +92,8 @@ def test_a_mesh_follows_legs_that_cross(monkeypatch: pytest.MonkeyPatch) -> None
     level, _ = select_level(field, rest, RASTERIZE, 0.5)
     vertices, faces = map(torch.from_numpy, extract_surface(field, level))
     generator = torch.Generator().manual_seed(0)
-    offsets = follow_video(vertices, faces, states, video, 0, level, RASTERIZE, SETTINGS, generator)
+    tracked = follow_video(vertices, faces, states, video, 0, RASTERIZE, generator)
+    offsets = register_tracking(vertices, tracked, faces, states, video, 0, level, RASTERIZE, SETTINGS)
     silhouettes = render_silhouettes(states, range(FRAMES), RASTERIZE, video.alpha[..., 0])
     still = silhouette_iou(vertices.expand(FRAMES, -1, -1), faces, silhouettes)
     followed = silhouette_iou(vertices + offsets, faces, silhouettes)
@@ -121,9 +127,7 @@ def test_a_mesh_that_loses_the_outline_is_tracked_with_limbs_that_swing(
         return points + torch.tensor([swinging_away if settings.integrate_rotations else away, 0, 0])
 
     monkeypatch.setattr(guided_mesh, "track_vertices", track)
-    monkeypatch.setattr(guided_mesh, "register_to_outlines", lambda vertices, offsets, *_, **__: offsets)
-    generator = torch.Generator()
-    offsets = follow_video(vertices, faces, states, video_of(states), 0, 0.5, RASTERIZE, SETTINGS, generator)
+    offsets = follow_video(vertices, faces, states, video_of(states), 0, RASTERIZE, torch.Generator())
     assert tracked == [False, True][:ways]
     assert float(offsets[1, :, 0].mean()) == pytest.approx(kept, abs=1e-5)
 
