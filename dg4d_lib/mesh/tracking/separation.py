@@ -222,7 +222,11 @@ def _contacts(
 
 
 class _Shifts:
-    """Shifts of control nodes at all frames: to the right, up and along the rays of the input camera."""
+    """Shifts of control nodes at all frames: to the right, up and along the rays of the input camera.
+
+    They minimize the sum of squared differences between neighboring nodes and successive frames, of squared shifts
+    (`PULLS`), and of squared gaps between what contacts lack and what they get (`PUSH`), by conjugate gradients.
+    """
 
     def __init__(self, balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: bool) -> None:
         frames, nodes = len(moved), len(balls.control.nodes)

@@ -24,13 +24,9 @@ LARGEST, SMALLEST = 0.5, 0.01  # radii of balls, world units: the first guess, a
 SHRINKINGS = 30  # at most, of every ball
 WIDE = 0.9  # radii between both places of a ball, at least: seen from its center they are 53 degrees apart
 TOUCHING = 8  # vertices nearest to a center, the farthest of which from the ball's own vertex is its second place
-FAR = (
-    0.06  # distance along the surface, world units, beyond half of a ball's circumference at which another part begins
-)
+FAR = 0.06  # world units: another part begins farther than this and half of a ball's circumference along the surface
 OUTSIDE = 1.3  # radii: nodes nearer to the center at rest belong to the ball's own part
-THINNER = (
-    0.8  # a vertex can lie in balls of so many times the radius of its own: the thicker part decides the direction
-)
+THINNER = 0.8  # of its own ball's radius: smaller balls hold no vertex, for the thicker part decides the direction
 
 
 class Submerged(NamedTuple):
