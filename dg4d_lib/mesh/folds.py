@@ -76,6 +76,10 @@ class DefectFinder:
         marked[self._first[folded]] = marked[self._second[folded]] = True
         return marked
 
+    def flipped(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
+        """Mark faces that point against the local rotation of the surface; none without a rest shape."""
+        return self._flipped(vertices, unit_normals(vertices, self._faces))
+
     def count(self, vertices: Float[np.ndarray, "v 3"]) -> SurfaceDefects:
         """Count the defects of a pose."""
         normals = unit_normals(vertices, self._faces)

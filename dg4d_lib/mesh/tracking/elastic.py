@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
@@ -26,6 +28,8 @@ from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
 PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
 PASSES = 5  # alternations of rotations and positions
+NEARBY = (1, 2, 3, 4, 6)  # rings of vertices around flipped faces that are relaxed, in one attempt each
+LOOSE, LONG = 1e-3, 20  # pull and alternations of these
 MAX_LOSS = 0.003  # of the silhouette IoU that the stronger relaxation of a frame may cost
 
 
@@ -87,7 +91,10 @@ def turn_back(
     faces: Int[Tensor, "f 3"],
     silhouettes: Bool[Tensor, "t k h w"],
 ) -> Float[Tensor, "t v 3"]:
-    """Return offsets with fewer flipped faces, by `unflip`, in frames where silhouettes and other defects allow it.
+    """Return offsets with fewer flipped faces, in frames where silhouettes and other defects allow it.
+
+    The surroundings of flipped faces are relaxed place by place, in several sizes, then all give way like a membrane
+    (`unflip`); of each, the attempt with the fewest defects stays if it has fewer.
 
     Args:
         vertices: in the reference frame, not split along seams.
@@ -96,16 +103,32 @@ def turn_back(
         silhouettes: of the frames (`render_silhouettes`).
     """
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
-    turned = offsets.clone()
+    turned, loose = offsets.clone(), np.full(len(vertices), LOOSE)
 
     def turn_frame(frame: int) -> None:
         moved = (vertices + offsets[frame]).double().numpy()
-        repaired, _ = unflip(body.rest, moved, body.faces, body.rotations(moved))
-        if repaired is moved or body.defective(repaired).sum() >= body.defective(moved).sum():
+        places = body.flipped_places(moved)
+        if not places and unflip(body.rest, moved, body.faces, body.rotations(moved))[0] is moved:
             return
         outline = silhouettes[frame, None]
-        if _iou(repaired, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
-            turned[frame] = torch.from_numpy(repaired - body.rest).to(offsets)
+        present, fewest = moved, int(body.defective(moved).sum())
+
+        def keep_best(attempts: list[Float64[np.ndarray, "v 3"]]) -> None:
+            nonlocal present, fewest
+            defects = [int(body.defective(attempt).sum()) for attempt in attempts]
+            for number in sorted(range(len(attempts)), key=defects.__getitem__):
+                if defects[number] >= fewest:
+                    break
+                if _iou(attempts[number], faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
+                    present, fewest = attempts[number], defects[number]
+                    break
+
+        for place in places:
+            regions = [grown(place, body.edges, rings) for rings in NEARBY]
+            keep_best([body.settle(present, present, loose, region, LONG) for region in regions])
+        keep_best([unflip(body.rest, present, body.faces, body.rotations(present))[0]])
+        if present is not moved:
+            turned[frame] = torch.from_numpy(present - body.rest).to(offsets)
 
     run_parallel([partial(turn_frame, frame) for frame in range(len(offsets))])
     return turned
@@ -133,6 +156,12 @@ class ElasticBody:
     def defective(self, moved: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
         """Mark the faces with defects that the rest shape does not have."""
         return self._finder.defective(moved) & self._sound_at_rest
+
+    def flipped_places(self, moved: Float64[np.ndarray, "v 3"]) -> list[Bool[np.ndarray, " v"]]:
+        """Mark the corners of faces that point against the local rotation of the surface, one connected place each."""
+        corners = np.flatnonzero(faces_to_vertices(self._finder.flipped(moved), self.faces, len(moved)))
+        found: tuple[int, NDArray[np.int32]] = connected_components(self.edges[corners][:, corners], directed=False)
+        return [np.isin(np.arange(len(moved)), corners[found[1] == place]) for place in range(found[0])]
 
     def rotations(self, moved: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3 3"]:
         """Return the rotation of every vertex that turns its edges at rest into the present ones best."""

@@ -8,7 +8,7 @@ import trimesh
 from dg4d_lib.mesh.extraction.silhouettes import cameras_of, silhouette_iou
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.folds import DefectFinder, genus, self_intersecting, surface_defects
-from dg4d_lib.mesh.tracking.elastic import relax, turn_back
+from dg4d_lib.mesh.tracking.elastic import ElasticBody, relax, turn_back
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 
@@ -184,6 +184,26 @@ def test_flipped_faces_are_turned_back_where_the_outlines_allow_it() -> None:
     assert before.flipped > after.flipped == 0
     far = np.linalg.norm(vertices - vertices[corner], axis=1) > 0.2
     torch.testing.assert_close(turned[1, far], states[1, far])
+
+
+def test_flipped_faces_are_relaxed_place_by_place() -> None:
+    vertices, faces = sphere(4)
+    vertices = 0.4 * vertices
+    overtaken = vertices.copy()
+    for corner, neighbor, _ in faces[[100, 3000]]:
+        overtaken[corner] += 2 * (vertices[neighbor] - vertices[corner])
+    places = ElasticBody(vertices, faces).flipped_places(overtaken)
+    assert len(places) == 2 and not (places[0] & places[1]).any()
+    rest, state, triangles = (
+        torch.from_numpy(vertices).float(),
+        torch.from_numpy(overtaken).float(),
+        torch.from_numpy(faces),
+    )
+    outlines = torch.stack([rasterize_mesh(rest[None], triangles, views).faces >= 0 for views in cameras_of(1)], 1)
+    turned = rest + turn_back(rest, (state - rest)[None], triangles, outlines)[0]
+    assert surface_defects(turned.numpy(), faces, vertices).flipped == 0
+    changed = (turned - state).norm(dim=1) > 1e-6
+    assert changed.sum() < 0.1 * len(vertices)  # a few rings around each
 
 
 def test_flipped_faces_stay_where_outlines_ask_for_them() -> None:
