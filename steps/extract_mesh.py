@@ -291,8 +291,9 @@ def _sound(
 ) -> tuple[Float[Tensor, "t v 3"], list[str]]:
     """Return offsets with fewer crossings and flipped faces, and a note if there were crossings."""
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
-    note = f"parts that had sunk into each other in {frames} frames were moved apart, as far as outlines allow"
-    return turn_back(vertices, separated, faces, silhouettes), [note] if frames else []
+    places = f"parts that had sunk into each other in {frames} of {len(offsets)} frames"
+    notes = [f"{places} were moved apart, as far as outlines allow"] if frames else []
+    return turn_back(vertices, separated, faces, silhouettes), notes
 
 
 def _fitted(

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 
@@ -32,6 +33,12 @@ def edge_graph(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     edges = mesh_edges(faces)
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     return coo_array((np.ones(2 * len(edges)), (rows, columns)), shape=(count, count)).tocsr()
+
+
+def connected_parts(edges: csr_array, chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the number of the connected part of every chosen vertex, where only edges between chosen ones count."""
+    labels: Int[np.ndarray, " n"] = connected_components(edges[chosen][:, chosen], directed=False)[1]
+    return labels
 
 
 def neighbor_means(edges: csr_array) -> csr_array:

@@ -8,14 +8,13 @@ Where limbs cross, it must give way far around them, which may move outlines; th
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from numba import njit
-from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
@@ -23,8 +22,17 @@ from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.models.flips import unflip
-from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown, screened_factors
+from dg4d_lib.mesh.neighbors import (
+    connected_parts,
+    edge_graph,
+    faces_to_vertices,
+    graph_laplacian,
+    grown,
+    screened_factors,
+)
 from dg4d_lib.mesh.tracking.skinning import nearest_rotation
+
+Vertices = Float64[np.ndarray, "v 3"]
 
 PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of its edges
 PASSES = 5  # alternations of rotations and positions
@@ -107,26 +115,23 @@ def turn_back(
 
     def turn_frame(frame: int) -> None:
         moved = (vertices + offsets[frame]).double().numpy()
-        places = body.flipped_places(moved)
-        if not places and unflip(body.rest, moved, body.faces, body.rotations(moved))[0] is moved:
-            return
         outline = silhouettes[frame, None]
-        present, fewest = moved, int(body.defective(moved).sum())
 
-        def keep_best(attempts: list[Float64[np.ndarray, "v 3"]]) -> None:
-            nonlocal present, fewest
-            defects = [int(body.defective(attempt).sum()) for attempt in attempts]
-            for number in sorted(range(len(attempts)), key=defects.__getitem__):
-                if defects[number] >= fewest:
-                    break
-                if _iou(attempts[number], faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
-                    present, fewest = attempts[number], defects[number]
-                    break
+        def best(present: Vertices, attempts: list[Vertices]) -> Vertices:
+            fewest = body.defective(present).sum()
+            defects = [body.defective(attempt).sum() for attempt in attempts]
+            for count, attempt in sorted(zip(defects, attempts, strict=True), key=itemgetter(0)):
+                if count < fewest and _iou(attempt, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
+                    return attempt
+            return present
 
-        for place in places:
+        present = moved
+        for place in body.flipped_places(moved):
             regions = [grown(place, body.edges, rings) for rings in NEARBY]
-            keep_best([body.settle(present, present, loose, region, LONG) for region in regions])
-        keep_best([unflip(body.rest, present, body.faces, body.rotations(present))[0]])
+            present = best(present, [body.settle(present, present, loose, region, LONG) for region in regions])
+        repaired, _ = unflip(body.rest, present, body.faces, body.rotations(present))
+        if repaired is not present:
+            present = best(present, [repaired])
         if present is not moved:
             turned[frame] = torch.from_numpy(present - body.rest).to(offsets)
 
@@ -160,8 +165,8 @@ class ElasticBody:
     def flipped_places(self, moved: Float64[np.ndarray, "v 3"]) -> list[Bool[np.ndarray, " v"]]:
         """Mark the corners of faces that point against the local rotation of the surface, one connected place each."""
         corners = np.flatnonzero(faces_to_vertices(self._finder.flipped(moved), self.faces, len(moved)))
-        found: tuple[int, NDArray[np.int32]] = connected_components(self.edges[corners][:, corners], directed=False)
-        return [np.isin(np.arange(len(moved)), corners[found[1] == place]) for place in range(found[0])]
+        parts = connected_parts(self.edges, corners)
+        return [np.isin(np.arange(len(moved)), corners[parts == part]) for part in np.unique(parts)]
 
     def rotations(self, moved: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3 3"]:
         """Return the rotation of every vertex that turns its edges at rest into the present ones best."""

@@ -13,10 +13,8 @@ from itertools import product
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
@@ -26,7 +24,7 @@ from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.folds import self_intersecting
 from dg4d_lib.mesh.models.control_graph import symmetric_matrix
-from dg4d_lib.mesh.neighbors import faces_to_vertices, graph_laplacian, grown, screened_factors
+from dg4d_lib.mesh.neighbors import connected_parts, faces_to_vertices, graph_laplacian, grown, screened_factors
 from dg4d_lib.mesh.tracking.elastic import MAX_LOSS
 from dg4d_lib.mesh.tracking.submerged import InnerBalls, Submerged
 
@@ -62,13 +60,14 @@ def separate(
         vertices: in the reference frame, not split along seams.
         offsets: of the tracked vertices at every frame.
         faces: counter-clockwise seen from outside.
-        silhouettes: of the frames (`render_silhouettes`), of whose IoU a mended frame may lose 0.003.
+        silhouettes: of the frames (`render_silhouettes`). Pushing apart may cost 0.003 of their IoU at the input view,
+            in the mean of the frames with crossings; a cap costs its frame at most 0.003, all views weighed.
         loop: the last frame is followed by the first one.
     """
     moved = (vertices + offsets).double().numpy()
     triangles = faces.numpy()
-    before = _crossings(moved, triangles)
-    if not before.any():
+    counts = _crossings(moved, triangles)
+    if not counts.any():
         return offsets, 0
     balls = InnerBalls(vertices.double().numpy(), triangles)
 
@@ -84,17 +83,17 @@ def separate(
         mended[frame] = unfold(pushed[frame], triangles)
 
     run_parallel([partial(mend, int(frame)) for frame in np.flatnonzero(_crossings(pushed, triangles))])
-    crossed = np.flatnonzero(before)
-    fewer = _crossings(mended, triangles).sum() <= GAIN * before.sum()
+    crossed, left = np.flatnonzero(counts), _crossings(mended, triangles)
+    fewer = left.sum() <= GAIN * counts.sum()
     if fewer and (iou(mended[crossed], crossed, 1) - iou(moved[crossed], crossed, 1)).mean() >= -MAX_LOSS:
-        moved = mended
+        moved, counts = mended, left
 
     def shrink(frame: int) -> None:
         here, views = np.array([frame]), silhouettes.shape[1]
         enough = iou(moved[here], here, views)[0] - MAX_LOSS
         moved[frame] = cap(balls, moved[frame], lambda attempt: bool(iou(attempt[None], here, views)[0] >= enough))
 
-    run_parallel([partial(shrink, int(frame)) for frame in np.flatnonzero(_crossings(moved, triangles))])
+    run_parallel([partial(shrink, int(frame)) for frame in np.flatnonzero(counts)])
     return torch.from_numpy(moved).to(offsets) - vertices, len(crossed)
 
 
@@ -198,12 +197,9 @@ def _pushes(
     pushes = np.zeros((len(balls.control.nodes), 3))
     if len(inside.vertices):
         towards = _unit(moved[inside.vertices] - centers[inside.balls])
-        regions: tuple[int, NDArray[np.int32]] = connected_components(
-            balls.body.edges[inside.vertices][:, inside.vertices], directed=False
-        )
-        count, labels = regions
-        sums = np.stack([np.bincount(labels, inside.depths * towards[:, axis], count) for axis in range(3)], 1)
-        pushes[balls.node[inside.vertices]] = sums[labels]
+        parts = connected_parts(balls.body.edges, inside.vertices)
+        sums = np.stack([np.bincount(parts, inside.depths * towards[:, axis]) for axis in range(3)], 1)
+        pushes[balls.node[inside.vertices]] = sums[parts]
     return pushes
 
 
@@ -225,7 +221,7 @@ class _Shifts:
     """Shifts of control nodes at all frames: to the right, up and along the rays of the input camera.
 
     They minimize the sum of squared differences between neighboring nodes and successive frames, of squared shifts
-    (`PULLS`), and of squared gaps between what contacts lack and what they get (`PUSH`), by conjugate gradients.
+    (weights `PULLS`), and of squared overlaps that are left at contacts (weight `PUSH`), by conjugate gradients.
     """
 
     def __init__(self, balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: bool) -> None:
@@ -267,15 +263,9 @@ class _Shifts:
         arms, radii = moved[frame, vertex] - centers[frame, ball], self._balls.radii[ball] + SLACK
         lacking = radii - np.linalg.norm(arms, axis=1)
         close = lacking > 0
-        frame, vertex, ball, towards, lacking = (
-            frame[close],
-            vertex[close],
-            ball[close],
-            _unit(arms[close]),
-            lacking[close],
-        )
-        if len(frame) == 0:
+        if not close.any():
             return False
+        (frame, vertex, ball), towards, lacking = contacts[close].T, _unit(arms[close]), lacking[close]
         frames, nodes = self._values.shape[1:]
         at_vertex = np.einsum("qi,qai->aq", towards, self._axes[frame, vertex])
         at_center = np.einsum("qi,qai->aq", towards, self._center_axes[frame, ball])
@@ -289,24 +279,24 @@ class _Shifts:
         transposed = csr_array(jacobian.T)
         wanted = lacking.clip(max=STEP) + jacobian @ self._values.ravel()
 
-        def energy(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        def normal(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
             by_axis = values.reshape(3, -1)
             smooth = np.stack([self._laplacian @ row + pull * row for row, pull in zip(by_axis, PULLS, strict=True)])
             result: Float64[np.ndarray, " n"] = smooth.ravel() + PUSH * (transposed @ (jacobian @ values))
             return result
 
-        def undone(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        def preconditioned(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
             by_axis = zip(self._factors, values.reshape(3, -1), strict=True)
             return np.concatenate([factors.solve(np.ascontiguousarray(row)) for factors, row in by_axis])
 
         size = (self._values.size,) * 2
         solved, _ = cg(
-            LinearOperator(size, matvec=energy, dtype=np.float64),
+            LinearOperator(size, matvec=normal, dtype=np.float64),
             PUSH * (transposed @ wanted),
             x0=self._values.ravel(),
             rtol=TOLERANCE,
             maxiter=ITERATIONS,
-            M=LinearOperator(size, matvec=undone, dtype=np.float64),
+            M=LinearOperator(size, matvec=preconditioned, dtype=np.float64),
         )
         self._values = solved.reshape(self._values.shape)
         return True

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_distances, surface_graph
@@ -77,8 +78,8 @@ class InnerBalls:
         self._places = np.stack([own, near[np.arange(len(own)), farthest]])
         self.ball_blend = csr_array(0.5 * (self.blend[self._places[0]] + self.blend[self._places[1]]))
         far = (along[:, self._places].min(1) > np.pi * self.radii + FAR).T
-        distances = np.linalg.norm(self._centers[:, None] - nodes, axis=2)
-        self._apart = np.ascontiguousarray(far & (distances > OUTSIDE * self.radii[:, None]))
+        outside = cdist(self._centers, nodes) > OUTSIDE * self.radii[:, None]
+        self._apart = np.ascontiguousarray(far & outside)
 
     def centers(self, moved: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "b 3"]:
         """Return the centers of the balls when the surface has moved."""
