@@ -210,6 +210,13 @@ class AssetSettings(Settings):
         description="loss of stretch and bend, quadratic near 0: `l1`: linear beyond; `log`: logarithmic, for few "
         "joints that bend a lot; `best`: both, in twice the time, and the motion that shows the video better is kept",
     )
+    rigid_parts: int = Field(
+        4,
+        ge=0,
+        le=16,
+        description="most rigid parts, as a box and its lid, that the motion is fitted with in a second try, where "
+        "so few explain it; the motion that shows the video better is kept; 0: no second try",
+    )
     inertia: NotNegative = Field(0.002, description="distance to the extrapolated motion while tracking")
     smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
     depth: NotNegative = Field(0.001, description="displacements along the viewing direction")

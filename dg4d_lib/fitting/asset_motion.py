@@ -1,46 +1,36 @@
 """Motion of a user's model: rigid transforms of control nodes on its surface, fitted to a driving video.
 
 The frames are tracked one after the other, by optical flow (`flow_tracking`) or by descent, then all are refined
-together. An as-rigid-as-possible energy (Sorkine and Alexa 2007), robust so that joints may bend, decides what the
-video leaves open; accelerations, and displacements in depth and out of the plane of symmetry, are penalized.
+together, under the losses of `asset_fit`. Where a few rigid parts explain the motion, and show the video better, they
+replace it (`rigid_fit`).
 """
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from skimage.registration import optical_flow_tvl1
-from torch import Tensor
+from jaxtyping import Float
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, FlowTracker, across_weight
-from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, resize_cutouts
-from dg4d_lib.fitting.node_motion import NodeBasis, NodeDescent, NodeMotion, NodeVariables
-from dg4d_lib.fitting.node_pose import CONTINUED, Pose
+from dg4d_lib.fitting.asset_fit import AssetFit
+from dg4d_lib.fitting.flow_tracking import FlowTracker
+from dg4d_lib.fitting.node_motion import NodeDescent, NodeMotion, NodeVariables
+from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.rigid_fit import ITERATIONS as RIGID_ITERATIONS
+from dg4d_lib.fitting.rigid_fit import fit_rigid_motion
+from dg4d_lib.fitting.rigid_parts import find_rigid_parts
 from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import thinned
 from dg4d_lib.geometry.mirror import mirror_normal
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
-from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
-from dg4d_lib.rasterizer.interface import BLUR, Rasterizer
+from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
-ADVICE = "lower asset.lr"
 FLOW_SHARE = 0.6  # of the iterations of a descent that follow the optical flow; the rest follow the pictures alone
-FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
-MATCH_ITERATIONS = 80  # of the colors at the first frame
-MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
-ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 EXPLAINED = 0.04  # error of the first frame up to which the model is at rest there
-SPEEDS = (0.0, CONTINUED, 1.0)  # extrapolations of the last motion that are tried, where rotations are integrated
 Report = Callable[[int, dict[str, float]], None]
 
 
@@ -72,18 +62,26 @@ def fit_asset_motion(
     surface = cloud.means.double().numpy(force=True) if surface is None else surface
     normal = mirror_normal(surface) if settings.across else None
     thin, bound = _thinned(cloud, graph, settings.fit_points)
-    found: list[tuple[float, NodeMotion]] = []
+    found: list[tuple[float, NodeMotion, AssetFit]] = []
+    done = 0
     for rigidity_loss in _rigidity_losses(settings):
         one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
-        fit, before = _Fit(thin, bound, video, rasterize, one, normal), len(found) * iterations(one, len(video))
-        motion = _fitted(fit, video, one, generator, partial(report_after, report, before))
-        found.append((fit.difference(motion), motion))
-    return min(found, key=lambda one: one[0])[1]
+        fit = AssetFit(thin, bound, video, rasterize, one, normal)
+        motion = _fitted(fit, video, one, generator, partial(report_after, report, done))
+        found.append((fit.difference(motion), motion, fit))
+        done += _free_iterations(one, len(video))
+    difference, motion, fit = min(found, key=lambda one: one[0])
+    rigid = find_rigid_parts(motion, fit.graph, fit.cloud.means, settings.rigid_parts)
+    if rigid is None:
+        return motion
+    better = fit_rigid_motion(fit, rigid, partial(report_after, report, done)).of_nodes(fit.graph)
+    return better if fit.difference(better) < difference else motion
 
 
 def iterations(settings: AssetSettings, frames: int) -> int:
-    """Return the number of iterations that a fit reports."""
-    return len(_rigidity_losses(settings)) * (settings.track_iterations * frames + settings.joint_iterations)
+    """Return the largest number of iterations that a fit reports."""
+    free = len(_rigidity_losses(settings)) * _free_iterations(settings, frames)
+    return free + (RIGID_ITERATIONS if settings.rigid_parts else 0)
 
 
 def report_after(report: Report, before: int, done: int, values: dict[str, float]) -> None:
@@ -91,12 +89,16 @@ def report_after(report: Report, before: int, done: int, values: dict[str, float
     report(before + done, values)
 
 
+def _free_iterations(settings: AssetSettings, frames: int) -> int:
+    return settings.track_iterations * frames + settings.joint_iterations
+
+
 def _rigidity_losses(settings: AssetSettings) -> list[Literal["l1", "log"]]:
     return ["l1", "log"] if settings.rigidity_loss == "best" else [settings.rigidity_loss]
 
 
 def _fitted(
-    fit: "_Fit", video: DrivingVideo, settings: AssetSettings, generator: torch.Generator, report: Report
+    fit: AssetFit, video: DrivingVideo, settings: AssetSettings, generator: torch.Generator, report: Report
 ) -> NodeMotion:
     """Track all frames, then refine them together."""
     frames, done = len(video), settings.track_iterations * len(video)
@@ -118,7 +120,7 @@ def _fitted(
     return variables.detach().motion(fit.basis)
 
 
-def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
+def _followed(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
@@ -130,7 +132,7 @@ def _followed(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report:
     return [NodeVariables.of(poses[frame], fit.basis) for frame in range(len(video))]
 
 
-def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
+def _first_pose(fit: AssetFit, tracker: FlowTracker) -> Pose:
     """Return the pose at the first frame, with the colors of the Gaussians fitted to it.
 
     It is that at rest if colors, opacities and sizes explain the frame: outlines that differ, as by holes of a texture
@@ -146,7 +148,7 @@ def _first_pose(fit: "_Fit", tracker: FlowTracker) -> Pose:
     return followed
 
 
-def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
+def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames one after the other along gradients; return their variables."""
     done = 0
     tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)]
@@ -172,186 +174,7 @@ def _descended(fit: "_Fit", video: DrivingVideo, settings: AssetSettings, report
     return tracked[1:]
 
 
-class _Fit:
-    """Losses of a fit, over its targets."""
-
-    def __init__(
-        self,
-        cloud: Gaussians,
-        graph: ControlGraph,
-        video: DrivingVideo,
-        rasterize: Rasterizer,
-        settings: AssetSettings,
-        normal: Float[np.ndarray, " 3"] | None,
-    ) -> None:
-        self.normal = normal  # of the mirror plane
-        self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
-        self.plain, self.graph = cloud.detach(), graph
-        self.cloud = antialiased(self.plain, self.camera)
-        self.rasterize, self.settings = rasterize, settings
-        cutouts = torch.cat([video.frames, video.alpha], -1)
-        self.colors, self.alphas = resize_cutouts(cutouts, settings.size)
-        self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
-        self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
-        self.basis = NodeBasis(graph, settings.smoothing, settings.integrate_rotations)
-        self.spans = graph.spans
-
-    def match_first_frame(self, pose: Pose) -> Gaussians:
-        """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's.
-
-        Returns:
-            The Gaussians that the fit renders from now on.
-        """
-        motion = NodeVariables.of(pose, self.basis).motion(self.basis)
-        means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
-        names = ("harmonics", "opacity_logits", "log_scales")
-        values = {name: getattr(self.plain, name).clone().requires_grad_() for name in names}
-        optimizer = torch.optim.Adam(
-            [{"params": [values[name]], "lr": lr} for name, lr in zip(names, MATCH_LR, strict=True)]
-        )
-        for step in range(MATCH_ITERATIONS):
-            state = replace(self.plain, means=means, quats=quat_multiply(quats, self.plain.quats), **values)
-            drawn = self.rasterize(antialiased(state, self.camera), [self.camera], means.new_tensor(WHITE))
-            loss = (drawn.color - self.colors[:1]).square().mean() + (drawn.alpha - self.alphas[:1]).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            gradients = [value.grad for value in values.values()]
-            check_finite(
-                "animate_asset", {"loss": loss}, gradients, f"colors, iteration {step + 1}", ADVICE, self.plain
-            )
-            optimizer.step()
-        found = replace(self.plain, **{name: value.detach() for name, value in values.items()})
-        self.cloud = antialiased(found, self.camera)
-        return self.cloud
-
-    def relative(self, values: Tensor) -> Tensor:
-        """Return lengths in tenths of the model's size."""
-        return values / self.unit
-
-    @torch.no_grad()
-    def start(self, tracked: Sequence[NodeVariables], frame: int) -> NodeVariables:
-        """Return where the descent of a frame starts, after those before it, the first of which is at rest.
-
-        Where rotations are integrated, it is the extrapolation at one of several speeds, or the variables of the frame
-        with the most similar picture, whichever has the smallest loss: wings turn back, and steps repeat.
-        """
-        if frame < 2:
-            return tracked[-1]
-        if not self.basis.integrated:
-            return tracked[-2].continued(tracked[-1])
-        starts = [tracked[-2].continued(tracked[-1], speed) for speed in SPEEDS]
-        picture = torch.cat([self.colors, self.alphas], -1)
-        errors = [float(pyramid_error(picture[frame : frame + 1], picture[k : k + 1])) for k in range(frame)]
-        starts.append(tracked[1 + min(range(frame), key=errors.__getitem__)])
-        return min(starts, key=lambda one: sum(map(float, self.losses(one.motion(self.basis), [frame]).values())))
-
-    @torch.no_grad()
-    def difference(self, motion: NodeMotion) -> float:
-        """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
-        losses = self._picture_losses(motion, list(range(len(motion.shifts))))
-        return float(losses["color"] + losses["alpha"])
-
-    def _picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
-        """Return the weighted losses of color and alpha of some frames."""
-        means = motion.points(self.cloud.means, self.graph)
-        count = len(frames)
-        states = replace(
-            self.cloud,
-            means=means,
-            log_scales=self.cloud.log_scales.expand(count, -1, -1),
-            quats=self.cloud.quats.expand(count, -1, -1),
-        )
-        rendering = self.rasterize(states, [self.camera] * count, means.new_tensor(WHITE))
-        color = pyramid_error(rendering.color, self.colors[frames]) / self.area
-        alpha = pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
-        return {"color": self.settings.color_weight * color, "alpha": self.settings.alpha_weight * alpha}
-
-    def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
-        """Return the weighted losses of some frames."""
-        settings = self.settings
-        shifts = self.relative(motion.nodes(self.graph) - self.graph.nodes)
-        depth = shifts[..., 2]
-        unseen = settings.depth * depth.square().mean() + settings.whole_depth * depth.mean(-1).square().mean()
-        if self.normal is not None:
-            across = (shifts @ torch.from_numpy(self.normal).to(shifts)).square().mean()
-            unseen = unseen + across_weight(settings, self.normal) * across
-        return {
-            **self._picture_losses(motion, frames),
-            "rigidity": settings.rigidity * self.rigidity(motion),
-            "unseen": unseen,
-        }
-
-    @torch.no_grad()
-    def flow_targets(self, before: NodeMotion, frame: int) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 2"]]:
-        """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
-        means = before.points(self.cloud.means, self.graph)
-        state = replace(self.cloud, means=means[0])
-        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
-        pixels, depth = self._projected(means[0])
-        size = self.settings.size
-        column, row = pixels.floor().long().clamp(0, size - 1).T
-        alpha = drawn.alpha[0, row, column, 0]
-        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
-        visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
-        pair = [luminance(self.colors[number]).cpu().numpy() for number in (frame - 1, frame)]
-        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
-        moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
-        return visible, moved
-
-    def flow_loss(
-        self, motion: NodeMotion, visible: Int[Tensor, " k"], targets: Float[Tensor, "k 2"]
-    ) -> Float[Tensor, ""]:
-        """Return the robust distance of projected Gaussians to their targets."""
-        if len(visible) == 0:
-            return targets.new_zeros(())
-        means = motion.points(self.cloud.means[visible], self.graph.of(visible))[0]
-        error = (self._projected(means)[0] - targets) / (FLOW_UNIT * self.settings.size)
-        return ((error.square().sum(-1) + 1).sqrt() - 1).mean()
-
-    def _projected(self, means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-        """Return pixels (column, row) and depths of points."""
-        matrix = self.camera.viewmat().to(means)
-        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
-        return seen[:, :2] / seen[:, 2:].clamp(min=0.1) * self.camera.focal + self.settings.size / 2, seen[:, 2]
-
-    def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
-        """Return the robust as-rigid-as-possible energy of the graph."""
-        matrices = self.graph.at_ends(quat_to_rotmat(motion.quats).flatten(2))
-        first, second = self.graph.at_ends(motion.shifts)
-        moved = self.spans + second - first
-        turned = [(matrix.unflatten(-1, (3, 3)) @ self.spans[..., None])[..., 0] for matrix in matrices]
-        stretch = torch.cat([(moved - span) / self.graph.lengths[:, None] for span in turned], 1)
-        bend = matrices[0] - matrices[1]
-        log = self.settings.rigidity_loss == "log"
-        return _robust(stretch, log).mean() + self.settings.bending * _robust(bend, log).mean()
-
-    def step(self, losses: dict[str, Tensor], variables: NodeVariables, place: str) -> None:
-        """Compute the gradients of the sum of the losses."""
-        total = torch.stack(list(losses.values())).sum()
-        for value in vars(variables).values():
-            value.grad = None
-        total.backward()
-        gradients = [value.grad for value in vars(variables).values()]
-        check_finite("animate_asset", {"loss": total}, gradients, place, ADVICE, self.cloud)
-
-
-def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:
-    """Return a cloud that covers as much after the rasterizer's low-pass filter as before it (Yu et al. 2024).
-
-    Without this, small opaque Gaussians widen all outlines by a pixel, and the fit shrinks the model.
-    """
-    pixels2 = (cloud.log_scales.topk(2, -1).values.mean(-1) + math.log(camera.focal / camera.radius)).mul(2).exp()
-    opacities = (cloud.opacities * pixels2 / (pixels2 + BLUR)).clamp(1e-3, 1 - 1e-3)
-    return replace(cloud, opacity_logits=opacities.logit())
-
-
 def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
     """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
     step = max(1, round(len(cloud) / count))
     return thinned(cloud, step), graph.of(torch.arange(0, len(cloud), step))
-
-
-def _robust(values: Float[Tensor, "*b c"], log: bool) -> Float[Tensor, "*b"]:
-    """Return a loss that is quadratic for small and linear for large vectors, or logarithmic."""
-    linear = (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
-    return LOG_SCALE * torch.log1p(linear / LOG_SCALE) if log else linear

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.asset_motion import antialiased
+from dg4d_lib.fitting.asset_fit import antialiased
 from dg4d_lib.fitting.losses import WHITE, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import thinned

@@ -39,14 +39,13 @@ def pyramid_error(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c
 
     Each is a mean over squares of half the width and three of three by three of these, which is nearly a Gaussian.
     """
-    difference = (ours - theirs).movedim(-1, 1)
-    errors = []
-    for width in LEVELS:
-        filtered = functional.avg_pool2d(difference, max(1, width // 2))
-        for _ in range(3 if width > 1 else 0):
-            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
-        errors.append(filtered.square().mean())
-    return torch.stack(errors).mean()
+    return torch.stack([level.square().mean() for level in _pyramid(ours - theirs)]).mean()
+
+
+def pyramid_residuals(ours: Float[Tensor, "b h w c"], theirs: Float[Tensor, "b h w c"]) -> Float[Tensor, "b r"]:
+    """Return the filtered differences of every picture, scaled so that their squares sum to its `pyramid_error`."""
+    levels = [level.flatten(1) for level in _pyramid(ours - theirs)]
+    return torch.cat([level / math.sqrt(level.shape[1] * len(levels)) for level in levels], 1)
 
 
 def reference_loss(
@@ -109,3 +108,13 @@ class Diverged(FitDiverged):
     def __init__(self, message: str, gaussians: Gaussians) -> None:
         super().__init__(message)
         self.gaussians = gaussians
+
+
+def _pyramid(difference: Float[Tensor, "b h w c"]) -> list[Float[Tensor, "b c _ _"]]:
+    levels = []
+    for width in LEVELS:
+        filtered = functional.avg_pool2d(difference.movedim(-1, 1), max(1, width // 2))
+        for _ in range(3 if width > 1 else 0):
+            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
+        levels.append(filtered)
+    return levels

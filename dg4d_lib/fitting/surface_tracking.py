@@ -33,6 +33,7 @@ DESCENT = AssetSettings(  # for surfaces that are guesses: what flow takes for c
     depth=0.005,
     whole_depth=0.15,
     across=0.0,
+    rigid_parts=0,
 )
 LOST = 0.85  # overlap of silhouettes with the video, IoU, below which it does not tell which motion is the better one
 WORSE = 0.05  # by which it may be smaller in a second try, for what is lost: limbs that swing do not stretch

@@ -32,7 +32,7 @@ from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Tracked
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
-FLOW = AssetSettings(rigidity_loss="l1")  # for hulls of many views: both losses take twice the time and gain nothing
+FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views: the other tries gain nothing
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )

@@ -9,11 +9,13 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting import asset_motion, flow_tracking
-from dg4d_lib.fitting.asset_motion import antialiased, fit_asset_motion, iterations
+from dg4d_lib.fitting import asset_fit, asset_motion, flow_tracking
+from dg4d_lib.fitting.asset_fit import AssetFit, antialiased
+from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion, iterations
 from dg4d_lib.fitting.flow_tracking import FlowTracker
 from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.fitting.node_pose import Pose
+from dg4d_lib.fitting.rigid_parts import RigidMotion
 from dg4d_lib.fitting.surface_tracking import DESCENT
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
@@ -46,6 +48,13 @@ def bent(points: np.ndarray, angle: float) -> np.ndarray:
     x = c * points[:, 0] - s * up
     y = np.where(points[:, 1] > 0, s * points[:, 0] + c * up, points[:, 1])
     return np.stack([x, y, points[:, 2]], 1)
+
+
+def opened(points: np.ndarray, angle: float) -> np.ndarray:
+    """Turn what is above the middle about x, as the lid of a box."""
+    c, s, upper = np.cos(angle), np.sin(angle), points[:, 1] > 0
+    y = np.where(upper, c * points[:, 1] - s * points[:, 2], points[:, 1])
+    return np.stack([points[:, 0], y, np.where(upper, s * points[:, 1] + c * points[:, 2], points[:, 2])], 1)
 
 
 @pytest.fixture(scope="module")
@@ -144,9 +153,32 @@ def test_a_motion_of_the_whole_in_depth_is_found(
 ) -> None:
     truth = -0.1 * np.arange(FRAMES)
     video = video_of([arm().parts[0].vertices + np.array([0, 0, depth]) for depth in truth])
-    settings = SETTINGS.model_copy(update={"joint_iterations": joint_iterations})
+    settings = SETTINGS.model_copy(update={"joint_iterations": joint_iterations, "rigid_parts": 0})
     depth = (follow(scene, video, settings) - scene[0].fine.vertices)[..., 2].mean(1)
     np.testing.assert_allclose(depth[1:] / truth[1:], 0.8, atol=0.1)
+
+
+def test_a_rigid_whole_is_found_in_depth_by_its_size(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> None:
+    truth = -0.1 * np.arange(FRAMES)
+    video = video_of([arm().parts[0].vertices + np.array([0, 0, depth]) for depth in truth])
+    depth = (follow(scene, video) - scene[0].fine.vertices)[..., 2].mean(1)
+    np.testing.assert_allclose(depth[1:] / truth[1:], 1, atol=0.1)
+
+
+def test_rigid_parts_that_show_the_video_worse_are_left(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video = video_of([arm().parts[0].vertices + np.array([0, 0, depth]) for depth in (0.0, -0.1, -0.2, -0.3)])
+    free = follow(scene, video, SETTINGS.model_copy(update={"rigid_parts": 0}))
+    tried = []
+
+    def misled(fit: AssetFit, start: RigidMotion, report: Report) -> RigidMotion:
+        tried.append(len(start.centers))
+        return start.changed(torch.full((*start.places.shape[:2], 6), 0.1))
+
+    monkeypatch.setattr(asset_motion, "fit_rigid_motion", misled)
+    np.testing.assert_array_equal(follow(scene, video), free)
+    assert tried == [1]
 
 
 def test_what_the_first_frame_lacks_of_the_model_is_no_motion(
@@ -235,10 +267,10 @@ def test_loops_are_tracked_from_both_ends(
 @pytest.mark.parametrize("log", [False, True])
 def test_tracking_and_refinement_have_one_rigidity(log: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gauss-Newton steps solve least squares, reweighted by the derivative of the refinement's loss."""
-    monkeypatch.setattr(asset_motion, "ROBUST", flow_tracking.ROBUST)
+    monkeypatch.setattr(asset_fit, "ROBUST", flow_tracking.ROBUST)
     stretch = torch.logspace(-3, 0.5, 20, dtype=torch.float64)[:, None] * torch.tensor([0.6, 0.0, 0.8])
     stretch.requires_grad_()
-    asset_motion._robust(stretch, log).sum().backward()
+    asset_fit.robust(stretch, log).sum().backward()
     divisor = torch.from_numpy(flow_tracking._softened(stretch.detach().numpy(), log))
     torch.testing.assert_close(stretch.grad, stretch.detach() / divisor[:, None], rtol=0.07, atol=0)
 
@@ -247,7 +279,7 @@ def test_of_two_rigidities_the_one_that_shows_the_video_better_is_kept(
     scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     surface, graph, video = scene
-    quick = SETTINGS.model_copy(update={"track_iterations": 1, "joint_iterations": 4})
+    quick = SETTINGS.model_copy(update={"track_iterations": 1, "joint_iterations": 4, "rigid_parts": 0})
     shown = {}
 
     def fitted(rigidity_loss: str) -> NodeMotion:
@@ -266,13 +298,13 @@ def test_of_two_rigidities_the_one_that_shows_the_video_better_is_kept(
         assert done[-1] == iterations(settings, FRAMES)
         return motion
 
-    original = asset_motion._Fit.difference
+    original = AssetFit.difference
 
-    def difference(fit: asset_motion._Fit, motion: NodeMotion) -> float:
+    def difference(fit: AssetFit, motion: NodeMotion) -> float:
         shown[fit.settings.rigidity_loss] = original(fit, motion)
         return -shown[fit.settings.rigidity_loss] if reverse else shown[fit.settings.rigidity_loss]
 
-    monkeypatch.setattr(asset_motion._Fit, "difference", difference)
+    monkeypatch.setattr(AssetFit, "difference", difference)
     reverse = False
     better = fitted("best")
     reverse = True

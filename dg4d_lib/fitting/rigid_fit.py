@@ -1,0 +1,152 @@
+"""Motion of few rigid parts, fitted to all frames of a driving video together by Gauss-Newton steps.
+
+A rigid part shows in its size how far it is, and in its outline how it is turned, where a surface that may stretch
+crumples instead. So displacements in depth are not penalized. Six variables per part and frame are few enough for
+second-order steps, which find depth as fast as what moves in the picture.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from dg4d_lib.fitting.asset_fit import AssetFit, robust
+from dg4d_lib.fitting.rigid_parts import RigidMotion
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+
+ITERATIONS = 24  # at most
+SHIFT, SHIFT_IN_DEPTH, TURN = 0.001, 0.0025, 0.002  # forward differences, world units; turns at the radius of a part
+SMALLEST_RADIUS = 0.03  # world units
+FARTHEST, WIDEST = 0.1, 0.4  # world units and radians that a part moves in one step
+DAMPING, LESS, MORE = 1e-3, 0.3, 6.0  # of the first step, relative to the diagonal; factors after success and failure
+INERTIA, JOINTS = 0.1, 0.1  # of the weights of accelerations and rigidity: rigid parts jump, and lids lift off
+SMALLEST_DAMPING, TRIES = 1e-5, 5
+SMALLEST_GAIN = 0.01  # of the loss by one step; below, the fit ends
+TOGETHER = 8  # frames whose derivatives are held in memory
+
+
+def fit_rigid_motion(
+    fit: AssetFit, start: RigidMotion, report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None
+) -> RigidMotion:
+    """Fit the motions of rigid parts: pictures, a plane of symmetry that is kept, accelerations, joints.
+
+    Args:
+        fit: what is compared.
+        start: near the solution.
+        report: called after every step with (steps done, named losses).
+    """
+    with torch.no_grad():
+        problem, found, damping = _Problem(fit, start), start, DAMPING
+        loss = problem.loss(found)
+        for step in range(ITERATIONS):
+            before = loss
+            matrix, gradient = problem.normal_equations(found)
+            for _ in range(TRIES):
+                damped = matrix + torch.diag(damping * matrix.diagonal() + 1e-8)
+                change = -torch.linalg.solve(damped, gradient).view(*found.quats.shape[:2], 6)
+                candidate = found.changed(_limited(change.to(found.places)))
+                loss = problem.loss(candidate)
+                if loss < before:
+                    found, damping = candidate, max(LESS * damping, SMALLEST_DAMPING)
+                    break
+                damping *= MORE
+            report(step + 1, {"rigid parts": min(loss, before)})
+            if loss > (1 - SMALLEST_GAIN) * before:
+                break
+    return found
+
+
+class _Problem:
+    """Least squares over the variables of all parts and frames."""
+
+    def __init__(self, fit: AssetFit, start: RigidMotion) -> None:
+        self.fit, self.graph = fit, fit.graph
+        ends = start.parts[self.graph.edges]
+        self.joints = torch.nonzero(ends[:, 0] != ends[:, 1])[:, 0]  # edges between parts
+        self.deltas = [_differences(fit, start, part) for part in range(len(start.centers))]
+
+    def loss(self, motion: RigidMotion) -> float:
+        """Return the sum of the squares."""
+        total = float(self._second_differences(self._nodes(motion)).square().sum())
+        return total + sum(
+            float(self._residuals(motion.at(chosen), chosen).square().sum()) for chosen in self._pieces(motion)
+        )
+
+    def normal_equations(self, motion: RigidMotion) -> tuple[Float64[Tensor, "n n"], Float64[Tensor, " n"]]:
+        """Return the matrix and half of the gradient by all variables, ordered by frame, part and coordinate."""
+        frames, count = len(motion.quats), 6 * len(self.deltas)
+        nodes = self._nodes(motion)
+        moves = self._derivative(motion, lambda one: self._nodes(one).flatten(1)).double()  # t 3m n
+        bend = torch.zeros(max(0, frames - 2), frames, dtype=torch.float64, device=moves.device)
+        for row, values in enumerate(bend):
+            values[row : row + 3] = torch.tensor([1.0, -2.0, 1.0])
+        bend *= self._inertia
+        # accelerations couple the frames
+        coupled = torch.einsum("tu,tin,uim->tnum", bend.T @ bend, moves, moves)
+        gradient = torch.einsum("tin,ti->tn", moves, bend.T @ (bend @ nodes.flatten(1).double()))
+        for chosen in self._pieces(motion):
+            piece = motion.at(chosen)
+            residuals = self._residuals(piece, chosen)
+            derivative = self._derivative(piece, lambda one, chosen=chosen: self._residuals(one, chosen))  # type: ignore[misc]
+            squares = (derivative.mT @ derivative).double()
+            for frame, square in zip(range(chosen.start, chosen.stop), squares, strict=True):
+                coupled[frame, :, frame] += square
+            gradient[chosen] += (derivative.mT @ residuals[..., None])[..., 0].double()
+        return coupled.reshape(frames * count, -1), gradient.reshape(-1)
+
+    @property
+    def _inertia(self) -> float:
+        return math.sqrt(INERTIA * self.fit.settings.smoothness / len(self.graph.nodes))
+
+    def _nodes(self, motion: RigidMotion) -> Float[Tensor, "t m 3"]:
+        return self.fit.relative(motion.of_nodes(self.graph).nodes(self.graph))
+
+    def _second_differences(self, nodes: Float[Tensor, "t m 3"]) -> Float[Tensor, "s m 3"]:
+        return self._inertia * (nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
+
+    def _residuals(self, motion: RigidMotion, frames: slice) -> Float[Tensor, "t r"]:
+        """Return what pictures and displacements differ by, and how far the joints come apart, robustly."""
+        moved = motion.of_nodes(self.graph)
+        seen = self.fit.residuals(moved, list(range(frames.start, frames.stop)))
+        edges, settings = self.graph.edges[self.joints], self.fit.settings
+        spans, lengths = self.graph.spans[self.joints], self.graph.lengths[self.joints, None]
+        nodes, turns = moved.nodes(self.graph), quat_to_rotmat(moved.quats)
+        gaps = nodes[:, edges[:, 1]] - nodes[:, edges[:, 0]]
+        turned = [(turns[:, edges[:, end]] @ spans[..., None])[..., 0] for end in (0, 1)]
+        stretch = torch.cat([(gaps - one) / lengths for one in turned], 1)
+        size = stretch.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+        loss = robust(stretch, settings.rigidity_loss == "log").clamp(min=0)[..., None]
+        weight = math.sqrt(JOINTS * settings.rigidity / (2 * len(self.graph.edges)))
+        return torch.cat([seen, (weight * loss.sqrt() / size * stretch).flatten(1)], 1)
+
+    def _derivative(
+        self, motion: RigidMotion, function: Callable[[RigidMotion], Float[Tensor, "t r"]]
+    ) -> Float[Tensor, "t r n"]:
+        """Return the derivatives of values per frame by the variables of that frame, by forward differences."""
+        start, columns = function(motion), []
+        for part, deltas in enumerate(self.deltas):
+            for coordinate, delta in enumerate(deltas):
+                change = torch.zeros(*motion.quats.shape[:2], 6, dtype=start.dtype, device=start.device)
+                change[:, part, coordinate] = delta
+                columns.append((function(motion.changed(change)) - start) / delta)
+        return torch.stack(columns, -1)
+
+    @staticmethod
+    def _pieces(motion: RigidMotion) -> list[slice]:
+        frames = len(motion.quats)
+        return [slice(first, min(first + TOGETHER, frames)) for first in range(0, frames, TOGETHER)]
+
+
+def _differences(fit: AssetFit, start: RigidMotion, part: int) -> list[float]:
+    """Return the forward differences of the variables of a part: three shifts, then three turns."""
+    nodes = fit.graph.nodes[start.parts == part]
+    radius = (nodes - start.centers[part]).square().sum(-1).mean().sqrt()
+    return [SHIFT, SHIFT, SHIFT_IN_DEPTH, *[TURN / max(float(radius), SMALLEST_RADIUS)] * 3]
+
+
+def _limited(change: Float[Tensor, "t k 6"]) -> Float[Tensor, "t k 6"]:
+    """Return steps, made smaller at frames where a part would move too far."""
+    size = torch.maximum(change[..., :3].abs() / FARTHEST, change[..., 3:].abs() / WIDEST).amax((1, 2))
+    return change / size.clamp(min=1)[:, None, None]
