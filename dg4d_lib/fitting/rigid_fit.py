@@ -7,6 +7,7 @@ second-order steps, which find depth as fast as what moves in the picture.
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float, Float64
@@ -69,7 +70,7 @@ class _Problem:
 
     def loss(self, motion: RigidMotion) -> float:
         """Return the sum of the squares."""
-        total = float(self._second_differences(self._nodes(motion)).square().sum())
+        total = float((self._inertia * self._nodes(motion).diff(n=2, dim=0)).square().sum())
         return total + sum(
             float(self._residuals(motion.at(chosen), chosen).square().sum()) for chosen in self._pieces(motion)
         )
@@ -79,17 +80,14 @@ class _Problem:
         frames, count = len(motion.quats), 6 * len(self.deltas)
         nodes = self._nodes(motion)
         moves = self._derivative(motion, lambda one: self._nodes(one).flatten(1)).double()  # t 3m n
-        bend = torch.zeros(max(0, frames - 2), frames, dtype=torch.float64, device=moves.device)
-        for row, values in enumerate(bend):
-            values[row : row + 3] = torch.tensor([1.0, -2.0, 1.0])
-        bend *= self._inertia
-        # accelerations couple the frames
-        coupled = torch.einsum("tu,tin,uim->tnum", bend.T @ bend, moves, moves)
-        gradient = torch.einsum("tin,ti->tn", moves, bend.T @ (bend @ nodes.flatten(1).double()))
+        accelerate = self._inertia * torch.eye(frames, dtype=torch.float64, device=moves.device).diff(n=2, dim=0)
+        stiffness = accelerate.T @ accelerate  # couples the frames
+        coupled = torch.einsum("tu,tin,uim->tnum", stiffness, moves, moves)
+        gradient = torch.einsum("tin,ti->tn", moves, stiffness @ nodes.flatten(1).double())
         for chosen in self._pieces(motion):
             piece = motion.at(chosen)
             residuals = self._residuals(piece, chosen)
-            derivative = self._derivative(piece, lambda one, chosen=chosen: self._residuals(one, chosen))  # type: ignore[misc]
+            derivative = self._derivative(piece, partial(self._residuals, frames=chosen))
             squares = (derivative.mT @ derivative).double()
             for frame, square in zip(range(chosen.start, chosen.stop), squares, strict=True):
                 coupled[frame, :, frame] += square
@@ -102,9 +100,6 @@ class _Problem:
 
     def _nodes(self, motion: RigidMotion) -> Float[Tensor, "t m 3"]:
         return self.fit.relative(motion.of_nodes(self.graph).nodes(self.graph))
-
-    def _second_differences(self, nodes: Float[Tensor, "t m 3"]) -> Float[Tensor, "s m 3"]:
-        return self._inertia * (nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
 
     def _residuals(self, motion: RigidMotion, frames: slice) -> Float[Tensor, "t r"]:
         """Return what pictures and displacements differ by, and how far the joints come apart, robustly."""
