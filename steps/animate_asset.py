@@ -32,6 +32,7 @@ from steps.runtime.job import Job, StepReport
 
 PICTURE_FRAMES = 6
 NOTE = "The motion of sides that the video does not show follows from the rigidity of the surface."
+RIGID_NOTE = "Rigid parts that the model moves as: {}. They show the video better than a surface that bends."
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,17 @@ def run(job: Job) -> StepReport:
     states = moved_states(cloud, graph, motion)
     deformation = framewise(cloud, states)
     write_motion(job.outputs["motion"], deformation, FramewiseSettings(), len(video), len(cloud))
-    notes = [NOTE, *(_write_mesh(job, mesh, motion, video.fps) if mesh else ())]
+    note = motion_note(motion, settings.rigid_parts)
+    notes = [note, *(_write_mesh(job, mesh, motion, video.fps, note) if mesh else ())]
     curves.write(job.outputs["curves"], "motion of the model", notes)
     write_png(job.outputs["picture"], _picture(states, rasterize))
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+
+
+def motion_note(motion: NodeMotion, most_parts: int) -> str:
+    """Return what the motion of sides that the video does not show follows from."""
+    parts = motion.rotation_count
+    return RIGID_NOTE.format(parts) if parts <= most_parts else NOTE
 
 
 def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:
@@ -119,7 +127,7 @@ def moved_vertices(
     return torch.from_numpy(np.stack(frames)), left
 
 
-def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float) -> list[str]:
+def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float, note: str) -> list[str]:
     """Write the model with morph targets, and as a tracked mesh with one texture; return notes."""
     vertices, flipped = moved_vertices(mesh.surface, mesh.graph, motion)
     gltf = job.settings.gltf
@@ -128,7 +136,7 @@ def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float) -> list[s
         mesh.placement.matrix,
         vertices.numpy(),
         fps,
-        {"notes": [NOTE]},
+        {"notes": [note]},
         gltf.interpolation.upper(),
         gltf.moving_normals,
     )

@@ -71,7 +71,8 @@ def fit_asset_motion(
         found.append((fit.difference(motion), motion, fit))
         done += _free_iterations(one, len(video))
     difference, motion, fit = min(found, key=lambda one: one[0])
-    rigid = find_rigid_parts(motion, fit.graph, fit.cloud.means, settings.rigid_parts)
+    most = settings.rigid_parts
+    rigid = find_rigid_parts(motion, fit.graph, fit.cloud.means, most) if most else None
     if rigid is None:
         return motion
     better = fit_rigid_motion(fit, rigid, partial(report_after, report, done)).of_nodes(fit.graph)

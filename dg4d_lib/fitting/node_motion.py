@@ -39,6 +39,11 @@ class NodeMotion:
     whole_quats: Float[Tensor, "t 4"]
     whole_shifts: Float[Tensor, "t 3"]
 
+    @property
+    def rotation_count(self) -> int:
+        """Number of different rotations over time: of rigid parts, if few; else about one per node."""
+        return len(torch.unique(self.quats.transpose(0, 1).flatten(1), dim=0))
+
     def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
         """Return the motion of some frames."""
         return NodeMotion(**{name: value[frames] for name, value in vars(self).items()})

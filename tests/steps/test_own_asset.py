@@ -14,6 +14,7 @@ from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.mesh.models.model import Model, ModelPart
 from dg4d_lib.mesh.models.surface_cloud import cover_surface
@@ -159,6 +160,14 @@ def test_the_motion_of_the_video_is_found(animated: tuple[Job, dict[str, Path]],
     cloud = read_ply(prepared.outputs["gaussians"])
     moved = fitted.deformation.displace(cloud.means, torch.linspace(0, 1, 3)).means.mean(1)
     torch.testing.assert_close(moved[2] - moved[0], torch.tensor([0.16, 0.0, 0.0]), atol=0.03, rtol=0)
+
+
+def test_the_note_tells_rigid_parts_from_a_surface_that_bends() -> None:
+    turns = torch.tensor([[1.0, 0, 0, 0], [0.9, 0.1, 0, 0], [0.9, 0, 0.1, 0]])
+    quats = turns[[0, 1, 1, 2, 2, 2]].expand(4, 6, 4)
+    motion = NodeMotion(quats, torch.zeros(4, 6, 3), quats[:, 0], torch.zeros(4, 3))
+    assert "parts that the model moves as: 3" in animate_asset.motion_note(motion, 4)
+    assert animate_asset.motion_note(motion, 2) == animate_asset.NOTE
 
 
 def test_the_package_has_the_users_own_mesh(animated: tuple[Job, dict[str, Path]], tmp_path: Path) -> None:
