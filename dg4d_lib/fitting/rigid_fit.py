@@ -53,7 +53,7 @@ def fit_rigid_motion(
                     found, damping = candidate, max(LESS * damping, SMALLEST_DAMPING)
                     break
                 damping *= MORE
-            report(step + 1, {"rigid parts": min(loss, before)})
+            report(step + 1, {"rigid parts": min(loss, before) / len(found.quats)})
             if loss > (1 - SMALLEST_GAIN) * before:
                 break
     return found
