@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
@@ -19,6 +19,7 @@ from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
 from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -46,11 +47,13 @@ class LoadedAsset:
         states: Gaussians at positions of the animation.
         surface: tracked mesh, or a mesh per frame.
         frames: number of frames.
+        own_model: the mesh is a model of the user's own, which may have flaws and folds at rest.
     """
 
     states: States
     surface: Surface
     frames: int
+    own_model: bool = False
 
 
 def run(job: Job) -> StepReport:
@@ -85,7 +88,8 @@ def read_asset(package: Path, folder: Path) -> LoadedAsset:
     wanted = (MANIFEST, ASSET, MERGED, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
-    return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames)
+    own_model = (folder / MERGED).exists()
+    return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames, own_model)
 
 
 def collect_evidence(
@@ -129,8 +133,8 @@ def collect_evidence(
         input_views=seen,
         side_views=around,
         turntable=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
-        flaws=max(_flaws(asset.surface, timestamp) for timestamp in timestamps),
-        folds=max(_folds(asset.surface, timestamp) for timestamp in timestamps),
+        flaws=max(_flaws(asset, timestamp) for timestamp in timestamps),
+        folds=max(_folds(asset, timestamp) for timestamp in timestamps),
     )
 
 
@@ -175,17 +179,34 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
     return RgbaImages(*(part.contiguous() for part in resize_cutouts(cutouts, SIZE)))
 
 
-def _flaws(surface: Surface, position: Float[Tensor, ""]) -> float:
-    """Return the broken edges and triangles per triangle, plus the share of inverted components."""
-    mesh = mesh_at(surface, position)
-    check = check_topology(*weld_vertices(mesh.vertices.numpy(), mesh.faces.numpy()))
+def _flaws(asset: LoadedAsset, position: Float[Tensor, ""]) -> float:
+    """Return the broken edges and triangles per triangle, and the share of inverted pieces; of a model, what is new."""
+    mesh = mesh_at(asset.surface, position)
+    flaws = _broken(mesh.vertices, mesh.faces)
+    return max(0.0, flaws - _broken(_rest(asset.surface, mesh), mesh.faces)) if asset.own_model else flaws
+
+
+def _broken(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> float:
+    check = check_topology(*weld_vertices(vertices.numpy(), faces.numpy()))
     broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
     return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)
 
 
-def _folds(surface: Surface, position: Float[Tensor, ""]) -> float:
-    """Return the share of triangles that cross others, are flipped or folded; a mesh per frame has none flipped."""
-    mesh = mesh_at(surface, position)
-    rest = surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices
-    joined, faces = join_seams(rest.numpy(), mesh.faces.numpy())
-    return float(DefectFinder(faces, rest.numpy()[joined]).defective(mesh.vertices.numpy()[joined]).mean())
+def _folds(asset: LoadedAsset, position: Float[Tensor, ""]) -> float:
+    """Return the share of triangles that cross others, are flipped or folded; of a model, of those that are new.
+
+    A mesh per frame has none flipped.
+    """
+    mesh = mesh_at(asset.surface, position)
+    rest = _rest(asset.surface, mesh).numpy()
+    joined, faces = join_seams(rest, mesh.faces.numpy())
+    finder = DefectFinder(faces, rest[joined])
+    defective = finder.defective(mesh.vertices.numpy()[joined])
+    if asset.own_model:
+        defective &= ~finder.defective(rest[joined])
+    return float(defective.mean())
+
+
+def _rest(surface: Surface, mesh: TexturedMesh) -> Float[Tensor, "v 3"]:
+    """Return the vertices at rest, of a mesh per frame its own."""
+    return surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices

@@ -184,7 +184,7 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             settings.flaws_most,
             "",
-            "boundary and non-manifold edges, degenerate and inverted triangles: per triangle",
+            "boundary and non-manifold edges, degenerate and inverted triangles: per triangle; not a given model's own",
             "extract again with another mesh.density_threshold or a larger mesh.grid",
         ),
         Gate(
@@ -193,7 +193,8 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             settings.folds_most,
             "",
-            "share of the triangles that cross others, are flipped or folded, in the worst frame: light shows them",
+            "share of the triangles that cross others, are flipped or folded, in the worst frame: light shows them; "
+            "what a given model has at rest does not count",
             "use mesh.mode=per_frame for complex motions, or a smaller mesh.grid",
         ),
         Gate(

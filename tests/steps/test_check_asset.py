@@ -170,6 +170,18 @@ def test_a_face_that_turns_over_in_one_frame_counts_as_a_fold() -> None:
     assert seen(parts_of(FRAMES, replace(asset, offsets=offsets))).folds > 0.2
 
 
+def test_of_a_given_model_what_it_has_at_rest_does_not_count() -> None:
+    asset = tracked()
+    open_mesh = replace(asset, mesh=replace(asset.mesh, faces=asset.mesh.faces[1:]))
+    own = replace(parts_of(FRAMES, open_mesh), own_model=True)
+    assert seen(parts_of(FRAMES, open_mesh)).flaws > 0
+    assert seen(own).flaws == 0
+    faces = torch.cat([asset.mesh.faces, asset.mesh.faces[:1].flip(1)])  # lies on another one: a fold at rest
+    folded = replace(asset, mesh=replace(asset.mesh, faces=faces))
+    assert seen(parts_of(FRAMES, folded)).folds > 0
+    assert seen(replace(parts_of(FRAMES, folded), own_model=True)).folds == 0
+
+
 def test_a_verdict_is_plain_json() -> None:
     answer = gates_as_json(evaluate_gates(seen(parts_of(FRAMES, tracked())), GateSettings()))
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
