@@ -88,8 +88,8 @@ def read_asset(package: Path, folder: Path) -> LoadedAsset:
     wanted = (MANIFEST, ASSET, MERGED, COMPACT, f"{MESHES}/", f"{SPLATS_FOLDER}/")
     unpack(package, folder, "the package", lambda name: name.startswith(wanted))
     manifest = read_manifest(folder)
-    own_model = (folder / MERGED).exists()
-    return LoadedAsset(read_states(folder, manifest), read_surface(folder, manifest), manifest.frames, own_model)
+    states, surface = read_states(folder, manifest), read_surface(folder, manifest)
+    return LoadedAsset(states, surface, manifest.frames, manifest.mode == "own")
 
 
 def collect_evidence(

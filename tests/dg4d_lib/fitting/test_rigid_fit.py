@@ -94,7 +94,7 @@ def test_squares_of_the_pyramid_sum_to_its_error() -> None:
 
 
 def test_joints_hold_parts_together(fit: AssetFit) -> None:
-    """Where parts come apart, the loss is larger, and robustly so."""
+    """Compare two gaps between parts: the wider one costs more, but less than in proportion to its square."""
     together = parts_of(fit, 1.0)
     problem = _Problem(fit, together)
     apart = [together.places.clone() for _ in range(2)]
