@@ -42,7 +42,7 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from steps.animate_asset import moved_vertices
+from steps.animate_asset import moved_vertices, moving_graph
 from steps.fitting.priors import read_bank_folder
 from steps.profiles import PREVIEW
 
@@ -204,7 +204,7 @@ def animate(own: OwnModel, settings: AssetSettings, seed: int = 0) -> tuple[Floa
     bound = graph.of(surface.nearest)
     video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
     motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
-    return moved_vertices(surface, graph, motion)
+    return moved_vertices(surface, moving_graph(graph, motion, settings.rigid_parts, surface.fine.faces), motion)
 
 
 def measure(

@@ -1,10 +1,10 @@
 """Step that sets a model of the user's own in motion, as the driving video shows it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
@@ -13,6 +13,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.fitting.node_motion import NodeMotion
+from dg4d_lib.fitting.rigid_parts import of_one_part_each
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
@@ -20,6 +21,7 @@ from dg4d_lib.mesh.models.atlas import merge_parts
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_of_points, point_graph
 from dg4d_lib.mesh.models.flips import unflip
 from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
+from dg4d_lib.mesh.neighbors import connected_parts, edge_graph
 from dg4d_lib.mesh.textured import TrackedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import FramewiseSettings
@@ -68,6 +70,11 @@ def run(job: Job) -> StepReport:
     with picture_of_divergence(job, rasterize):
         generator = torch.Generator().manual_seed(job.seed)
         motion = fit_asset_motion(cloud, graph, video, rasterize, settings, generator, curves.add)
+    if mesh:
+        mesh = replace(mesh, graph=moving_graph(mesh.graph, motion, settings.rigid_parts, mesh.surface.fine.faces))
+        graph = mesh.graph.of(mesh.surface.nearest)
+    else:
+        graph = moving_graph(graph, motion, settings.rigid_parts)
     states = moved_states(cloud, graph, motion)
     deformation = framewise(cloud, states)
     write_motion(job.outputs["motion"], deformation, FramewiseSettings(), len(video), len(cloud))
@@ -80,8 +87,26 @@ def run(job: Job) -> StepReport:
 
 def motion_note(motion: NodeMotion, most_parts: int) -> str:
     """Return what the motion of sides that the video does not show follows from."""
-    parts = motion.rotation_count
+    parts = int(motion.parts.max()) + 1
     return RIGID_NOTE.format(parts) if parts <= most_parts else NOTE
+
+
+def moving_graph(
+    graph: ControlGraph, motion: NodeMotion, most_parts: int, faces: Int[np.ndarray, "f 3"] | None = None
+) -> ControlGraph:
+    """Return the graph by which a motion moves the points: by one part each, if it is a motion of few rigid parts.
+
+    Args:
+        graph: of the points.
+        motion: of its nodes.
+        most_parts: that count as few.
+        faces: of a welded surface whose vertices the points are.
+    """
+    if int(motion.parts.max()) >= most_parts:
+        return graph
+    count = len(graph.indices)
+    pieces = None if faces is None else connected_parts(edge_graph(faces, count), np.arange(count))
+    return of_one_part_each(graph, motion.parts, None if pieces is None else torch.from_numpy(pieces).long())
 
 
 def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
@@ -19,7 +20,6 @@ from dg4d_lib.fitting.losses import resize_cutouts
 from dg4d_lib.images import color_over_white
 from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
 from dg4d_lib.mesh.folds import DefectFinder
-from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -127,14 +127,16 @@ def collect_evidence(
         seen[form] = _pictures(_drawn(draw, positions, [front] * len(positions)))
         around[form] = _pictures(_drawn(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps)))
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
+    flaws, folds = _worst_defects(asset, timestamps)
     return GateInputs(
         picture=_resized(cutout[None]),
         video=_resized(torch.cat([video.frames, video.alpha], -1)[frames.long()]),
         input_views=seen,
         side_views=around,
         turntable=Turntable(turn[..., 3:4], turn[..., 4:], viewmats(ring), front.focal),
-        flaws=max(_flaws(asset, timestamp) for timestamp in timestamps),
-        folds=max(_folds(asset, timestamp) for timestamp in timestamps),
+        flaws=flaws,
+        folds=folds,
+        own_model=asset.own_model,
     )
 
 
@@ -179,34 +181,57 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
     return RgbaImages(*(part.contiguous() for part in resize_cutouts(cutouts, SIZE)))
 
 
-def _flaws(asset: LoadedAsset, position: Float[Tensor, ""]) -> float:
-    """Return the broken edges and triangles per triangle, and the share of inverted pieces; of a model, what is new."""
-    mesh = mesh_at(asset.surface, position)
-    flaws = _broken(mesh.vertices, mesh.faces)
-    return max(0.0, flaws - _broken(_rest(asset.surface, mesh), mesh.faces)) if asset.own_model else flaws
+@dataclass(frozen=True)
+class _Rest:
+    """A mesh at rest, which its other moments are compared with.
+
+    Attributes:
+        joined: vertices without copies along seams.
+        finder: of crossings, flips and folds; its faces join these vertices.
+        flaws: of the mesh at rest that do not count.
+        folded: triangles that do not count, for they have such defects at rest.
+    """
+
+    joined: Int[np.ndarray, " n"]
+    finder: DefectFinder
+    flaws: float
+    folded: Bool[np.ndarray, " f"]
+
+    @classmethod
+    def of(cls, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], own_model: bool) -> "_Rest":
+        """Look at a mesh at rest; nothing counts of what a model of the user's own has there."""
+        rest = vertices.numpy()
+        joined, corners = join_seams(rest, faces.numpy())
+        finder = DefectFinder(corners, rest[joined])
+        if own_model:
+            return cls(joined, finder, _broken(vertices, faces), finder.defective(rest[joined]))
+        return cls(joined, finder, 0.0, np.zeros(len(corners), bool))
+
+    def added(self, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> tuple[float, float]:
+        """Return flaws per triangle, and the share of triangles that cross others, are flipped or folded."""
+        folded = self.finder.defective(vertices.numpy()[self.joined]) & ~self.folded
+        return max(0.0, _broken(vertices, faces) - self.flaws), float(folded.mean())
+
+
+def _worst_defects(asset: LoadedAsset, positions: Float[Tensor, " b"]) -> tuple[float, float]:
+    """Return the most flaws and folds at some positions; of a model, those that the motion adds.
+
+    A mesh per frame has its own rest, so none of its triangles is flipped.
+    """
+    rest, found = None, []
+    for position in positions:
+        mesh = mesh_at(asset.surface, position)
+        if not isinstance(asset.surface, Asset4D):
+            rest = _Rest.of(mesh.vertices, mesh.faces, asset.own_model)
+        elif rest is None:
+            rest = _Rest.of(asset.surface.mesh.vertices, mesh.faces, asset.own_model)
+        found.append(rest.added(mesh.vertices, mesh.faces))
+    flaws, folds = zip(*found, strict=True)
+    return max(flaws), max(folds)
 
 
 def _broken(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> float:
+    """Return the broken edges and triangles per triangle, and the share of inverted pieces."""
     check = check_topology(*weld_vertices(vertices.numpy(), faces.numpy()))
     broken = check.boundary_edges + check.nonmanifold_edges + check.inconsistent_edges + check.degenerate_faces
     return broken / max(1, check.triangles) + check.inverted_components / max(1, check.components)
-
-
-def _folds(asset: LoadedAsset, position: Float[Tensor, ""]) -> float:
-    """Return the share of triangles that cross others, are flipped or folded; of a model, of those that are new.
-
-    A mesh per frame has none flipped.
-    """
-    mesh = mesh_at(asset.surface, position)
-    rest = _rest(asset.surface, mesh).numpy()
-    joined, faces = join_seams(rest, mesh.faces.numpy())
-    finder = DefectFinder(faces, rest[joined])
-    defective = finder.defective(mesh.vertices.numpy()[joined])
-    if asset.own_model:
-        defective &= ~finder.defective(rest[joined])
-    return float(defective.mean())
-
-
-def _rest(surface: Surface, mesh: TexturedMesh) -> Float[Tensor, "v 3"]:
-    """Return the vertices at rest, of a mesh per frame its own."""
-    return surface.mesh.vertices if isinstance(surface, Asset4D) else mesh.vertices

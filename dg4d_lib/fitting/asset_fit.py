@@ -46,8 +46,10 @@ class AssetFit:
         rasterize: Rasterizer,
         settings: AssetSettings,
         normal: Float[np.ndarray, " 3"] | None,
+        resting: bool = False,
     ) -> None:
         self.normal = normal  # of the mirror plane
+        self.resting = resting  # exactly, at the first frame, which then stays so
         self.camera = replace(OrbitCamera(), width=settings.size, height=settings.size)
         self.plain, self.graph = cloud.detach(), graph
         self.cloud = antialiased(self.plain, self.camera)

@@ -43,6 +43,7 @@ def fit_asset_motion(
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
     surface: Float[np.ndarray, "p 3"] | None = None,
+    resting: bool = False,
 ) -> NodeMotion:
     """Fit the motion of a placed model to a video of the camera at azimuth and elevation 0.
 
@@ -55,6 +56,7 @@ def fit_asset_motion(
         generator: draws the frames of joint iterations.
         report: called after every iteration with (iterations done, named losses).
         surface: points of the model's surface at rest, whose mirror plane counts; None: the means of the Gaussians.
+        resting: the first frame shows the model exactly at rest.
 
     Raises:
         FitDiverged: the loss became non-finite.
@@ -66,7 +68,7 @@ def fit_asset_motion(
     done = 0
     for rigidity_loss in _rigidity_losses(settings):
         one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
-        fit = AssetFit(thin, bound, video, rasterize, one, normal)
+        fit = AssetFit(thin, bound, video, rasterize, one, normal, resting)
         motion = _fitted(fit, video, one, generator, partial(report_after, report, done))
         found.append((fit.difference(motion), motion, fit))
         done += _free_iterations(one, len(video))
@@ -105,7 +107,7 @@ def _fitted(
     frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
     variables = NodeVariables.joined(track(fit, video, settings, report))
-    descent = NodeDescent(variables, fit.basis)
+    descent = NodeDescent(variables, fit.basis, held=int(fit.resting))
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
         moved = variables.motion(fit.basis)
@@ -141,7 +143,8 @@ def _first_pose(fit: AssetFit, tracker: FlowTracker) -> Pose:
     """
     rest, unmatched = Pose.rest(len(fit.graph.nodes)), tracker.cloud
     tracker.cloud = fit.match_first_frame(rest)
-    if tracker.error(rest, 0) <= EXPLAINED:
+    fit.resting = fit.resting or tracker.error(rest, 0) <= EXPLAINED
+    if fit.resting:
         return rest
     tracker.cloud = unmatched
     followed = tracker.followed(rest, 0)
@@ -151,9 +154,9 @@ def _first_pose(fit: AssetFit, tracker: FlowTracker) -> Pose:
 
 def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames one after the other along gradients; return their variables."""
-    done = 0
-    tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)]
-    for frame in range(len(video)):
+    tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)] * (2 if fit.resting else 1)
+    done = settings.track_iterations * (len(tracked) - 1)
+    for frame in range(len(tracked) - 1, len(video)):
         start = fit.start(tracked, frame)
         variables, steps = start.copy(), settings.track_iterations
         descent = NodeDescent(variables, fit.basis)

@@ -40,9 +40,10 @@ class NodeMotion:
     whole_shifts: Float[Tensor, "t 3"]
 
     @property
-    def rotation_count(self) -> int:
-        """Number of different rotations over time: of rigid parts, if few; else about one per node."""
-        return len(torch.unique(self.quats.transpose(0, 1).flatten(1), dim=0))
+    def parts(self) -> Int[Tensor, " m"]:
+        """Rigid part of every node, from 0 on: nodes with equal rotations at all frames are one part."""
+        found: Tensor = torch.unique(self.quats.transpose(0, 1).flatten(1), dim=0, return_inverse=True)[1]
+        return found
 
     def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
         """Return the motion of some frames."""
@@ -158,10 +159,14 @@ class NodeVariables:
 
 
 class NodeDescent:
-    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak."""
+    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak.
 
-    def __init__(self, variables: NodeVariables, basis: NodeBasis) -> None:
-        self.values = vars(variables)
+    As steps do not shrink with gradients, they would move a first frame that is solved: `held` says how many first
+    frames stay as they are.
+    """
+
+    def __init__(self, variables: NodeVariables, basis: NodeBasis, held: int = 0) -> None:
+        self.values, self.held = vars(variables), held
         self.factors = INTEGRATED_FACTORS if basis.integrated else FACTORS
         self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
         self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
@@ -179,7 +184,8 @@ class NodeDescent:
             second.lerp_(value.grad.square(), 1 - BETA2)
             largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
             moment = first / (1 - BETA1**self.count)
-            value.sub_(lr * self.factors[name] * moment / (largest.sqrt() + 1e-12))
+            change = lr * self.factors[name] * moment / (largest.sqrt() + 1e-12)
+            value[self.held :].sub_(change[self.held :])
 
 
 def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:

@@ -40,14 +40,16 @@ def fit_rigid_motion(
     """
     with torch.no_grad():
         problem, found, damping = _Problem(fit, start), start, DAMPING
+        held = 6 * len(start.centers) if fit.resting else 0  # variables of the first frame
         loss = problem.loss(found)
         for step in range(ITERATIONS):
             before = loss
             matrix, gradient = problem.normal_equations(found)
             for _ in range(TRIES):
                 damped = matrix + torch.diag(damping * matrix.diagonal() + 1e-8)
-                change = -torch.linalg.solve(damped, gradient).view(*found.quats.shape[:2], 6)
-                candidate = found.changed(_limited(change.to(found.places)))
+                change = torch.zeros_like(gradient)
+                change[held:] = -torch.linalg.solve(damped[held:, held:], gradient[held:])
+                candidate = found.changed(_limited(change.view(*found.quats.shape[:2], 6).to(found.places)))
                 loss = problem.loss(candidate)
                 if loss < before:
                     found, damping = candidate, max(LESS * damping, SMALLEST_DAMPING)

@@ -4,7 +4,7 @@ Neighboring clusters of points are merged as long as one rigid motion fits both 
 (Ward 1963) by the error of rigid fits (Kabsch 1976), from the control nodes on.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 UNEXPLAINED = 0.15  # of the displacements of the points, root mean square, that rigid parts may leave
+NEARLY_ONE = 0.9  # share of the weights of a piece of the surface that one part has, above which it has all
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,27 @@ def find_rigid_parts(
         torch.from_numpy(quats.copy()).to(graph.nodes),
         torch.from_numpy(places.swapaxes(0, 1).copy()).to(graph.nodes),
     )
+
+
+def of_one_part_each(
+    graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"] | None = None
+) -> ControlGraph:
+    """Return a graph whose points move with one rigid part each, so that nothing bends where parts meet.
+
+    Args:
+        graph: weights of the nodes of several parts.
+        parts: of the nodes, from 0 on.
+        pieces: connected piece of the surface that every point belongs to, from 0 on. Pieces that nearly belong to one
+            part belong to it whole; points of other pieces each to the part with the most weight.
+    """
+    shares = graph.blend(functional.one_hot(parts).to(graph.weights)[None])[0]
+    if pieces is not None:
+        sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
+        means = sums / sums.sum(1, keepdim=True)
+        whole = (means.amax(1) > NEARLY_ONE)[pieces, None]
+        shares = torch.where(whole, means[pieces], shares)
+    first = (parts == torch.arange(shares.shape[1])[:, None]).int().argmax(1)  # any node of a part moves as the part
+    return replace(graph, indices=first[shares.argmax(1)][:, None], weights=torch.ones_like(graph.weights[:, :1]))
 
 
 @dataclass(frozen=True)

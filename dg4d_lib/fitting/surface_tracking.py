@@ -133,7 +133,9 @@ def track_vertices(
         if len(chosen) > 1:
             part = DrivingVideo(video.frames[chosen], video.alpha[chosen], video.fps)
             told = partial(report_after, report, done)
-            motion = fit_asset_motion(gaussians, graph.of(nearest), part, rasterize, settings, generator, told, points)
+            motion = fit_asset_motion(
+                gaussians, graph.of(nearest), part, rasterize, settings, generator, told, points, resting=True
+            )
             done += iterations(settings, len(part))
             for number, frame in enumerate(chosen[1:], 1):
                 moved[frame] = motion.at(slice(number, number + 1)).points(vertices, bound)[0]

@@ -73,6 +73,7 @@ class GateInputs:
         turntable: the splats from all around.
         flaws: broken edges and triangles of the mesh, per triangle.
         folds: share of the triangles of the mesh that cross others, are flipped or folded, in the worst frame.
+        own_model: the mesh is a model of the user's own; flaws and folds are those that its motion adds.
     """
 
     picture: RgbaImages
@@ -82,6 +83,7 @@ class GateInputs:
     turntable: Turntable
     flaws: float
     folds: float
+    own_model: bool = False
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             "folds",
             {MESH: inputs.folds},
             None,
-            settings.folds_most,
+            settings.added_folds_most if inputs.own_model else settings.folds_most,
             "",
             "share of the triangles that cross others, are flipped or folded, in the worst frame: light shows them; "
             "what a given model has at rest does not count",

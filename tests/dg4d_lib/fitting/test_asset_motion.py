@@ -189,6 +189,17 @@ def test_what_the_first_frame_lacks_of_the_model_is_no_motion(
     assert np.linalg.norm(follow(scene, video) - scene[0].fine.vertices, axis=-1).max() < 0.02
 
 
+@pytest.mark.parametrize("rigid_parts", [0, 4])
+def test_a_first_frame_at_rest_stays_exactly_so(
+    scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo], rigid_parts: int
+) -> None:
+    rest = arm().parts[0].vertices
+    video = video_of([opened(rest, angle) for angle in (0.0, 0.3, 0.6, 0.9)])
+    found = follow(scene, video, SETTINGS.model_copy(update={"rigid_parts": rigid_parts}))
+    np.testing.assert_allclose(found[0], scene[0].fine.vertices, atol=1e-6)
+    assert np.linalg.norm(found[-1] - found[0], axis=-1).max() > 0.1
+
+
 def test_a_first_frame_in_another_pose_is_followed(scene: tuple[SurfaceCloud, ControlGraph, DrivingVideo]) -> None:
     rest = scene[0].fine.vertices
     truth = bent(rest, 2 * ANGLE)

@@ -1,6 +1,7 @@
 """Few rigid parts: found where they explain a motion, with the rigid motions of least squares, else not found."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts
+from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts, of_one_part_each
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 FRAMES = 5
@@ -103,3 +104,29 @@ def test_turns_of_a_change_are_angles_about_the_center(points: torch.Tensor) -> 
     arm = graph.nodes[upper, 1] - 0.35
     assert torch.allclose(moved[upper, 2], arm * math.sin(0.02), atol=1e-6)
     assert torch.allclose(moved[~upper], torch.tensor([0.0, 0, 0.3]).expand(16, 3), atol=1e-6)
+
+
+def test_points_between_parts_move_with_one_of_them(points: torch.Tensor) -> None:
+    graph = grid_graph(points)
+    motion = lid(graph).of_nodes(graph)
+    below, above = 15, 16  # nodes on both sides of the edge
+    between = replace(graph, indices=torch.tensor([[below, above]] * 2), weights=torch.tensor([[0.7, 0.3], [0.3, 0.7]]))
+    alone = replace(graph, indices=torch.tensor([[below], [above]]), weights=torch.ones(2, 1))
+    place = points[:1].expand(2, 3)
+    found = motion.points(place, of_one_part_each(between, motion.parts))
+    assert torch.allclose(found, motion.points(place, alone), atol=1e-6)
+    assert not torch.allclose(found, motion.points(place, between), atol=0.01)
+
+
+def test_pieces_nearly_of_one_part_are_of_that_part_whole(points: torch.Tensor) -> None:
+    graph = grid_graph(points)
+    parts = lid(graph).parts
+    owners = parts[graph.indices[:, 0]]
+    stray = torch.nonzero(owners == 1)[:3, 0]
+    most = (owners == 0).long()
+    most[stray] = 1  # a piece of the lower part with three points that the upper nodes move
+    found = parts[of_one_part_each(graph, parts, most).indices[:, 0]]
+    assert found[most == 1].tolist() == [0] * int(most.sum())
+    assert found[most == 0].tolist() == [1] * int((1 - most).sum())
+    mixed = of_one_part_each(graph, parts, torch.zeros_like(most))  # one piece of both: every point as it was
+    assert torch.equal(parts[mixed.indices[:, 0]], owners)

@@ -101,6 +101,13 @@ def test_what_is_wrong_is_named(pictures: RgbaImages, failing: set[str]) -> None
     assert {"consistency", "flaws", "agreement", "floaters"} <= {gate.name for gate in gates if gate.passed}
 
 
+@pytest.mark.parametrize(("own_model", "passed"), [(False, False), (True, True)])
+def test_parts_of_a_given_model_may_slide_into_each_other(own_model: bool, passed: bool) -> None:
+    crossing = replace(evidence(SWAYING, SWAYING), folds=0.05, own_model=own_model)
+    found = {gate.name: gate for gate in evaluate_gates(crossing, GateSettings())}
+    assert found["folds"].passed is passed
+
+
 def test_one_torn_frame_is_enough_for_the_silhouette() -> None:
     torn = SWAYING.alpha.clone()
     torn[3, :, : SIZE // 2] = 0
@@ -211,12 +218,11 @@ def test_a_plain_subject_is_as_sharp_as_can_be() -> None:
 
 
 def test_every_threshold_decides() -> None:
-    found = {gate.name: gate for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())}
     for knob in set(GateSettings.model_fields) - {"cutout"}:  # gates of another step
-        name, _, side = knob.rpartition("_")
-        changed = evaluate_gates(
-            evidence(SWAYING, SWAYING), GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5})
-        )
+        name, _, side = knob.removeprefix("added_").rpartition("_")
+        seen = replace(evidence(SWAYING, SWAYING), own_model=knob.startswith("added_"))
+        found = {gate.name: gate for gate in evaluate_gates(seen, GateSettings())}
+        changed = evaluate_gates(seen, GateSettings(**{knob: getattr(GateSettings(), knob) * 0.5}))
         moved = {gate.name: gate for gate in changed}
         assert getattr(moved[name], side) == pytest.approx(getattr(found[name], side) / 2)
         assert all(moved[other] == found[other] for other in found if other != name)
