@@ -109,7 +109,9 @@ def of_one_part_each(
         means = sums / sums.sum(1, keepdim=True)
         whole = (means.amax(1) > NEARLY_ONE)[pieces, None]
         shares = torch.where(whole, means[pieces], shares)
-    first = (parts == torch.arange(shares.shape[1])[:, None]).int().argmax(1)  # any node of a part moves as the part
+    first = (
+        (parts == torch.arange(shares.shape[1], device=parts.device)[:, None]).int().argmax(1)
+    )  # any node of a part moves as the part
     return replace(graph, indices=first[shares.argmax(1)][:, None], weights=torch.ones_like(graph.weights[:, :1]))
 
 
