@@ -103,15 +103,14 @@ def of_one_part_each(
         pieces: connected piece of the surface that every point belongs to, from 0 on. Pieces that nearly belong to one
             part belong to it whole; points of other pieces each to the part with the most weight.
     """
-    shares = graph.blend(functional.one_hot(parts).to(graph.weights)[None])[0]
+    members = functional.one_hot(parts)
+    shares = graph.blend(members.to(graph.weights)[None])[0]
     if pieces is not None:
         sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
         means = sums / sums.sum(1, keepdim=True)
         whole = (means.amax(1) > NEARLY_ONE)[pieces, None]
         shares = torch.where(whole, means[pieces], shares)
-    first = (
-        (parts == torch.arange(shares.shape[1], device=parts.device)[:, None]).int().argmax(1)
-    )  # any node of a part moves as the part
+    first = members.argmax(0)  # any node of a part moves as the part does
     return replace(graph, indices=first[shares.argmax(1)][:, None], weights=torch.ones_like(graph.weights[:, :1]))
 
 
