@@ -1,22 +1,28 @@
 """GLBs of other programs: triangles and base colors at rest, and the same file with morph targets over time.
 
-Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. Existing
-animations are dropped, since they would move the model twice; existing morph targets keep their default weights.
+Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. A skeleton moves,
+and morph targets do what it cannot. Existing animations are dropped, since they would move the model twice; existing
+morph targets keep their default weights.
 Files are not trusted: every index, size and number is checked before it is used.
 """
 
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dg4d_lib.assets.formats import meshopt
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument
+from dg4d_lib.assets.formats.foreign_nodes import Matrices, global_matrices, mesh_matrices
+from dg4d_lib.assets.formats.foreign_skeleton import SkeletonMotion, SkinnedVertices, fit_skeleton
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument, read_accessor
+from dg4d_lib.assets.formats.joint_motion import close_loop
 from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.assets.formats.tracks import Animation
@@ -24,11 +30,12 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
 
 MAX_POSES = 128  # morph targets; players keep their weights in uniforms, of which every GPU has at least 256
-MAX_NODES = 100_000
-MAX_DEPTH = 200  # of nested nodes
 TRIANGLES, STRIP, FAN = 4, 5, 6
+FLAT = 1e-9  # determinant of a matrix that cannot be inverted, relative to the cube of its norm
 PLACEMENT = "dg4d placement"
 MOTION = "dg4d motion"
+MOVES = "the skeleton of the model moves; what it cannot do is in morph targets"
+AT_REST = "the skeleton of the model is kept at rest, for {}; morph targets have the motion"
 UNREADABLE = {
     "KHR_draco_mesh_compression": "its meshes are compressed with Draco; export it without compression",
     "KHR_texture_basisu": "its textures are in KTX2; export them as PNG or JPEG",
@@ -102,7 +109,7 @@ def write_moving_glb(
     interpolation: str = "LINEAR",
     moving_normals: bool = True,
 ) -> tuple[bytes, tuple[str, ...]]:
-    """Write the file with a morph target per frame, in the coordinates of the world.
+    """Write the file with a morph target per frame, and its skeleton in motion, in the coordinates of the world.
 
     Args:
         glb: the file at rest.
@@ -128,12 +135,15 @@ def write_moving_glb(
     if step > 1:
         notes.append(f"the animated model has every {step}. frame as a key; {MAX_POSES} morph targets are allowed")
     moved, rate = moved[::step], fps / step
-    if "skins" in tree:
-        notes.append("the skeleton of the model is kept at rest; its motion is in morph targets")
     keys = list(range(len(moved) + 1))  # the last one shows frame 0 again
     track = np.eye(len(moved), dtype=np.float32)[np.array(keys) % len(moved)]  # the base is the model as given
     back: NDArray[np.float64] = np.linalg.inv(placement).astype(np.float64)
     animation = Animation(document, rate)
+    skeleton, about = _fitted_skeleton(glb, [_transformed(back[None], state) for state in moved])
+    notes += [about] if "skins" in tree else []
+    if skeleton is not None:
+        _animate_joints(tree, animation, skeleton, keys, interpolation)
+    posed = [skeleton.globals(frame) for frame in range(len(moved))] if skeleton else []
     start = 0
     for node, pieces in _by_node(glb.pieces).items():
         mesh = {**tree["meshes"][tree["nodes"][node]["mesh"]]}
@@ -144,7 +154,9 @@ def write_moving_glb(
             states = moved[:, start : start + len(piece.local)]
             start += len(piece.local)
             primitive = mesh["primitives"][piece.primitive]
-            primitive["targets"] = _targets(document, piece, states, back, primitive, moving_normals)
+            moving = (mesh_matrices(glb.reader, node, piece.primitive, one) for one in posed)
+            inverses = (_inverse(one) @ back for one in moving) if posed else repeat(_inverse(piece.matrices) @ back)
+            primitive["targets"] = _targets(document, piece, states, inverses, primitive, moving_normals)
         mesh["primitives"] = [one for one in mesh["primitives"] if "targets" in one]  # all need as many targets
         mesh["weights"] = track[0].tolist()
         mesh["extras"] = {**_object(mesh.get("extras")), "targetNames": [f"frame_{pose:03d}" for pose in keys[:-1]]}
@@ -158,6 +170,45 @@ def write_moving_glb(
     return document.to_bytes(), tuple(notes)
 
 
+def _fitted_skeleton(glb: ForeignGlb, moved: Sequence[NDArray[np.float64]]) -> tuple[SkeletonMotion | None, str]:
+    """Return the motion of the model's skeleton, if it can have one, and a note on it.
+
+    Args:
+        glb: the file at rest.
+        moved: vertices of all pieces at every frame, in the coordinates of the model.
+    """
+    tree, start, skinned = glb.reader.tree, 0, []
+    for piece in glb.pieces:
+        rows = slice(start, start := start + len(piece.local))
+        item = tree["nodes"][piece.node]
+        attributes = tree["meshes"][item["mesh"]]["primitives"][piece.primitive]["attributes"]
+        if "skin" in item and "JOINTS_0" in attributes:
+            states = np.stack([state[rows] for state in moved])
+            skinned.append(SkinnedVertices(tree["skins"][item["skin"]], attributes, piece.part.vertices, states))
+    skeleton = fit_skeleton(glb.reader, global_matrices(tree), skinned)
+    if skeleton is None:
+        return None, AT_REST.format("it cannot move as the video shows")
+    try:
+        skeleton.tracks()
+    except ValueError:
+        return None, AT_REST.format("its nodes are scaled unevenly")
+    return skeleton, MOVES
+
+
+def _animate_joints(
+    tree: dict[str, Any], animation: Animation, skeleton: SkeletonMotion, keys: list[int], interpolation: str
+) -> None:
+    """Add the motion of the joints; they get translations, rotations and scales in place of matrices."""
+    for joint, (translations, turns, scale) in skeleton.tracks().items():
+        quats = Rotation.from_matrix(turns).as_quat()
+        signs = np.where((quats[1:] * quats[:-1]).sum(1) < 0, -1, 1).cumprod()
+        quats[1:] *= signs[:, None]
+        node = tree["nodes"][joint] = {key: value for key, value in tree["nodes"][joint].items() if key != "matrix"}
+        node.update(translation=translations[0].tolist(), rotation=quats[0].tolist(), scale=scale.tolist())
+        name = str(node.get("name", f"node {joint}"))
+        animation.add_transform(joint, name, keys, close_loop(translations), close_loop(quats), interpolation)
+
+
 def _by_node(pieces: Sequence[Piece]) -> dict[int, list[Piece]]:
     found: dict[int, list[Piece]] = {}
     for piece in pieces:
@@ -169,17 +220,19 @@ def _targets(
     document: GltfDocument,
     piece: Piece,
     states: NDArray[np.float32],
-    back: NDArray[np.float64],
+    inverses: Iterable[NDArray[np.float64]],
     primitive: dict[str, Any],
     moving_normals: bool,
 ) -> list[dict[str, int]]:
-    """Add displacements in the coordinates of the mesh; return the morph targets."""
-    inverse = np.linalg.inv(piece.matrices) @ back
+    """Add displacements in the coordinates of the mesh; return the morph targets.
+
+    `inverses` lead there from the world, at every frame.
+    """
     turning = "NORMAL" in primitive["attributes"] and moving_normals
     normals_of = SmoothNormals(piece.local, piece.part.faces) if turning else None
     rest = normals_of(piece.local) if normals_of else None
     targets = []
-    for frame, state in enumerate(states):
+    for frame, (state, inverse) in enumerate(zip(states, inverses, strict=False)):
         local = _transformed(inverse, state).astype(np.float32)
         name = f"{piece.part.name} frame_{frame:03d}"
         target = {"POSITION": document.add_accessor(name, local - piece.local, VERTEX_DATA)}
@@ -239,7 +292,7 @@ def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
     for extension, remedy in UNREADABLE.items():
         if extension in tree.get("extensionsRequired", ()):
             raise BadInput(f"the model cannot be read: {remedy}")
-    globals_ = _global_matrices(tree)
+    globals_ = global_matrices(tree)
     nodes = [n for n in sorted(globals_) if "mesh" in tree["nodes"][n]]
     faces, notes = 0, []
     for node in nodes:
@@ -272,7 +325,7 @@ def _piece(
     reader: GlbReader,
     node: int,
     number: int,
-    globals_: dict[int, NDArray[np.float64]],
+    globals_: Matrices,
     pictures: dict[int, NDArray[np.uint8]],
 ) -> Piece:
     tree = reader.tree
@@ -286,9 +339,9 @@ def _piece(
         if weight and "POSITION" in target:
             local = local + float(weight) * read_accessor(reader, target["POSITION"])
     count = len(local)
-    matrices = globals_[node][None]
-    if "skin" in item and "JOINTS_0" in attributes:
-        matrices = _skin_matrices(reader, tree["skins"][item["skin"]], attributes, globals_)
+    matrices = mesh_matrices(reader, node, number, globals_)
+    if len(matrices) > 1 and _flat(matrices).any():
+        raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
     faces = _faces(reader, primitive, count)
     material = tree["materials"][primitive["material"]] if "material" in primitive else {}
     shading = _object(material.get("pbrMetallicRoughness"))
@@ -310,34 +363,6 @@ def _piece(
         masked=material.get("alphaMode", "OPAQUE") != "OPAQUE",
     )
     return Piece(node, number, local.astype(np.float32), matrices, part)
-
-
-def _skin_matrices(
-    reader: GlbReader, skin: dict[str, Any], attributes: dict[str, int], globals_: dict[int, NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """Return the blended matrix of every vertex in the rest pose of the skeleton."""
-    joints = [globals_[joint] for joint in skin["joints"]]
-    inverse = np.tile(np.eye(4), (len(joints), 1, 1))
-    if "inverseBindMatrices" in skin:
-        inverse = read_accessor(reader, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)[: len(joints)]
-    posed = np.stack(joints) @ inverse
-    total: NDArray[np.float64] | None = None
-    share: NDArray[np.float64] | float = 0.0
-    for group in range(4):
-        if f"JOINTS_{group}" not in attributes:
-            break
-        indices = read_accessor(reader, attributes[f"JOINTS_{group}"], raw=True).astype(np.int64)
-        weights = read_accessor(reader, attributes[f"WEIGHTS_{group}"]).astype(np.float64)
-        blended = np.einsum("vk,vkij->vij", weights, posed[indices])
-        total = blended if total is None else total + blended
-        share = share + weights.sum(1)
-    assert total is not None  # the caller has seen JOINTS_0
-    broken = np.abs(share) < 1e-6
-    total = total / np.where(broken, 1, share)[:, None, None]
-    total[broken] = np.eye(4)
-    if np.linalg.det(total[:, :3, :3]).__abs__().min() < 1e-12:
-        raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
-    return total
 
 
 def _faces(reader: GlbReader, primitive: dict[str, Any], count: int) -> NDArray[np.int64]:
@@ -391,92 +416,20 @@ def _picture(reader: GlbReader, index: int) -> NDArray[np.uint8]:
     return decode_picture(reader.view(image["bufferView"]), str(image.get("name", index)))
 
 
-def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:
-    """Return the rows of an accessor; floats, or with `raw` the stored integers.
-
-    Raises:
-        ValueError: it reaches beyond its view.
-    """
-    tree = reader.tree
-    accessor = tree["accessors"][index]
-    kind = np.dtype(
-        {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
-    )
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
-    count = int(accessor["count"])
-    if not 0 <= count <= 50_000_000:
-        raise ValueError(f"an accessor has {count} rows")
-    if "bufferView" in accessor:
-        view = tree["bufferViews"][accessor["bufferView"]]
-        rows = _rows(
-            reader, accessor["bufferView"], accessor.get("byteOffset", 0), kind, width, count, view.get("byteStride")
-        )
-    else:
-        rows = np.zeros((count, width), kind)
-    if "sparse" in accessor:
-        sparse, rows = accessor["sparse"], rows.copy()
-        where, what = sparse["indices"], sparse["values"]
-        into = {5121: "u1", 5123: "<u2", 5125: "<u4"}[where["componentType"]]
-        places = _rows(
-            reader, where["bufferView"], where.get("byteOffset", 0), np.dtype(into), 1, sparse["count"], None
-        )
-        rows[places[:, 0]] = _rows(
-            reader, what["bufferView"], what.get("byteOffset", 0), kind, width, sparse["count"], None
-        )
-    if raw or kind.kind == "f":
-        return rows
-    values = rows.astype(np.float32)
-    return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") else values
-
-
-def _rows(
-    reader: GlbReader, view: int, offset: int, kind: np.dtype[Any], width: int, count: int, stride: int | None
-) -> NDArray[Any]:
-    content = reader.view(view)
-    step = stride or width * kind.itemsize
-    if offset < 0 or step < width * kind.itemsize:
-        raise ValueError("an accessor has a negative offset or a stride that is too small")
-    if count and offset + (count - 1) * step + width * kind.itemsize > len(content):
-        raise ValueError("an accessor reaches beyond its view")
-    return np.ndarray((count, width), kind, content, offset, (step, kind.itemsize))
-
-
-def _global_matrices(tree: dict[str, Any]) -> dict[int, NDArray[np.float64]]:
-    """Return the global matrix of every node of the scene."""
-    nodes = tree.get("nodes", [])
-    if len(nodes) > MAX_NODES:
-        raise BadInput(f"the model has {len(nodes)} nodes; at most {MAX_NODES} are read")
-    if not tree.get("scenes"):
-        children = {child for node in nodes for child in node.get("children", ())}
-        tree["scenes"] = [{"nodes": [index for index in range(len(nodes)) if index not in children]}]
-        tree["scene"] = 0
-    found: dict[int, NDArray[np.float64]] = {}
-    waiting = [(index, np.eye(4), 1) for index in tree["scenes"][tree.get("scene", 0)].get("nodes", ())]
-    while waiting:
-        index, parent, depth = waiting.pop()
-        if index in found or depth > MAX_DEPTH:
-            raise BadInput("the nodes of the model form a circle or are nested too deeply; export it again")
-        found[index] = parent @ _local_matrix(nodes[index])
-        waiting += [(child, found[index], depth + 1) for child in nodes[index].get("children", ())]
+def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverses; where a twisted joint flattens a vertex's surroundings, the nearest thing to one."""
+    flat = _flat(matrices)
+    found: NDArray[np.float64] = np.linalg.inv(np.where(flat[:, None, None], np.eye(4), matrices))
+    if flat.any():
+        found[flat] = np.linalg.pinv(matrices[flat])
     return found
 
 
-def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
-    if "matrix" in node:
-        return np.array(node["matrix"], float).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
-    scale = 2 / max(x * x + y * y + z * z + w * w, 1e-12)
-    turn = np.array(
-        [
-            [1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)],
-            [scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)],
-            [scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)],
-        ]
-    )
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), float)
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
+def _flat(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which matrices flatten what they move; small ones need not, as of quantized meshes."""
+    linear = matrices[:, :3, :3]
+    flat: NDArray[np.bool_] = np.abs(np.linalg.det(linear)) <= FLAT * np.linalg.norm(linear, axis=(1, 2)) ** 3
+    return flat
 
 
 def _transformed(matrices: NDArray[np.float64], points: NDArray[Any]) -> NDArray[np.float64]:

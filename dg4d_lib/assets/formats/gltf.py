@@ -225,3 +225,51 @@ def _padded(rows: NDArray[Any]) -> NDArray[Any]:
     """Pad rows with zeros to whole words."""
     missing = -rows[0].nbytes % _ALIGNMENT // rows.itemsize
     return np.pad(rows, ((0, 0), (0, missing))) if missing else rows
+
+
+def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:
+    """Return the rows of an accessor; floats, or with `raw` the stored integers.
+
+    Raises:
+        ValueError: it reaches beyond its view.
+    """
+    tree = reader.tree
+    accessor = tree["accessors"][index]
+    kind = _COMPONENTS[accessor["componentType"]]
+    width = (_WIDTHS | {"MAT4": 16})[accessor["type"]]
+    count = int(accessor["count"])
+    if not 0 <= count <= 50_000_000:
+        raise ValueError(f"an accessor has {count} rows")
+    if "bufferView" in accessor:
+        view = tree["bufferViews"][accessor["bufferView"]]
+        rows = _rows(
+            reader, accessor["bufferView"], accessor.get("byteOffset", 0), kind, width, count, view.get("byteStride")
+        )
+    else:
+        rows = np.zeros((count, width), kind)
+    if "sparse" in accessor:
+        sparse, rows = accessor["sparse"], rows.copy()
+        where, what = sparse["indices"], sparse["values"]
+        into = {5121: "u1", 5123: "<u2", 5125: "<u4"}[where["componentType"]]
+        places = _rows(
+            reader, where["bufferView"], where.get("byteOffset", 0), np.dtype(into), 1, sparse["count"], None
+        )
+        rows[places[:, 0]] = _rows(
+            reader, what["bufferView"], what.get("byteOffset", 0), kind, width, sparse["count"], None
+        )
+    if raw or kind.kind == "f":
+        return rows
+    values = rows.astype(np.float32)
+    return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") else values
+
+
+def _rows(
+    reader: GlbReader, view: int, offset: int, kind: np.dtype[Any], width: int, count: int, stride: int | None
+) -> NDArray[Any]:
+    content = reader.view(view)
+    step = stride or width * kind.itemsize
+    if offset < 0 or step < width * kind.itemsize:
+        raise ValueError("an accessor has a negative offset or a stride that is too small")
+    if count and offset + (count - 1) * step + width * kind.itemsize > len(content):
+        raise ValueError("an accessor reaches beyond its view")
+    return np.ndarray((count, width), kind, content, offset, (step, kind.itemsize))

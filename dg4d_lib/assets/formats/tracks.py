@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dg4d_lib.assets.formats.gltf import GltfDocument
 
 POINTER = "KHR_animation_pointer"
+STILL = 1e-6  # change of a place, relative to its distance, or of a quaternion, that is not written
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,21 @@ class Animation:
     ) -> None:
         """Animate the morph weights of a node; `weights` has a row per key, which is a frame number."""
         self._add(name, keys, weights.ravel(), interpolation, {"node": node, "path": "weights"})
+
+    def add_transform(
+        self,
+        node: int,
+        name: str,
+        keys: list[int],
+        translations: NDArray[np.float32],
+        rotations: NDArray[np.float32],
+        interpolation: str,
+    ) -> None:
+        """Animate the place of a node and its rotation, xyzw; rows are keys, as of `add_morph`."""
+        if np.abs(translations - translations[0]).max() > STILL * (1 + np.abs(translations[0]).max()):
+            self._add(f"{name} place", keys, translations, interpolation, {"node": node, "path": "translation"})
+        if np.abs(rotations - rotations[0]).max() > STILL:
+            self._add(f"{name} rotation", keys, rotations, interpolation, {"node": node, "path": "rotation"})
 
     def add_visibility(self, node: int, name: str, span: Span) -> None:
         """Show a node during its span only; readers without animation show the node of frame 0."""

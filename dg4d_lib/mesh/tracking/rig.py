@@ -192,7 +192,7 @@ def _cluster(rest: Array, moved: Array, clusters: NDArray[np.int64]) -> tuple[Ar
     """Alternate between fitting a rigid motion per cluster and assigning vertices; drop empty clusters."""
     for _ in range(CLUSTERING):
         members = np.eye(clusters.max() + 1)[clusters]
-        maps = _rigid(rest, moved, members[:, members.any(0)])
+        maps = rigid_maps(rest, moved, members[:, members.any(0)])
         clusters = _squared_distances(rest, moved, maps).argmin(1)
     kept, clusters = np.unique(clusters, return_inverse=True)
     return maps[kept], clusters
@@ -238,12 +238,12 @@ def _fit_bones(rest: Array, moved: Array, maps: Array, weights: Array) -> Array:
             continue
         weight = column[members, None, None]
         target = residual[members] / weight + _displaced(rest[members], maps[bone])
-        maps[bone] = _rigid(rest[members], target, np.square(weight[..., 0]))[0]
+        maps[bone] = rigid_maps(rest[members], target, np.square(weight[..., 0]))[0]
         residual[members] = weight * (target - _displaced(rest[members], maps[bone]))
     return maps
 
 
-def _rigid(rest: Array, moved: Array, weights: Array) -> Array:
+def rigid_maps(rest: Array, moved: Array, weights: Array) -> Array:
     """Fit rigid motions to weighted vertices (Procrustes); return displacement matrices "k t 3 4"."""
     weights = weights / weights.sum(0)
     centers, flat = weights.T @ rest, moved.reshape(len(moved), -1)

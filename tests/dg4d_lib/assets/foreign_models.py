@@ -51,8 +51,11 @@ def box_glb(**changes: object) -> bytes:
     return document.to_bytes()
 
 
-def skinned_glb() -> bytes:
-    """Return a strip of 8 quads along y on two joints; the upper one is moved by 1 along x at rest."""
+def skinned_glb(bound: bool = False) -> bytes:
+    """Return a strip of 8 quads along y on two joints.
+
+    The upper joint is moved by 1 along x at rest, or with `bound` in the middle of the strip, where it is bound.
+    """
     document = GltfDocument({})
     heights = np.linspace(0, 1, 9, dtype=np.float32)
     vertices = np.concatenate([np.stack([np.full(9, x), heights, np.zeros(9)], 1) for x in (0.0, 0.3)]).astype("<f4")
@@ -68,9 +71,15 @@ def skinned_glb() -> bytes:
     indices = document.add_accessor("triangles", faces.ravel().astype("<u2"), INDEX_DATA)
     mesh = document.add("meshes", name="strip", primitives=[{"attributes": attributes, "indices": indices}])
     root = document.add("nodes", name="root")
-    tip = document.add("nodes", name="tip", translation=[1.0, 0.0, 0.0])
+    tip = document.add("nodes", name="tip", translation=[0.0, 0.5, 0.0] if bound else [1.0, 0.0, 0.0])
     document.tree["nodes"][root]["children"] = [tip]
     skin = document.add("skins", name="bones", joints=[root, tip])
+    if bound:
+        binding = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+        binding[1, 3, 1] = -0.5  # column by column
+        view = document.add_view("binding", binding.tobytes())
+        matrices = document.add("accessors", bufferView=view, componentType=5126, count=2, type="MAT4")
+        document.tree["skins"][skin]["inverseBindMatrices"] = matrices
     node = document.add("nodes", name="strip", mesh=mesh, skin=skin, translation=[9.0, 9.0, 9.0])
     document.tree["scene"] = document.add("scenes", nodes=[root, node])
     return document.to_bytes()

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from foreign_models import CORNERS, box_glb, skinned_glb
 
-from dg4d_lib.assets.formats.foreign_glb import read_accessor, read_foreign_glb, write_moving_glb
-from dg4d_lib.assets.formats.gltf import GlbReader
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
 from dg4d_lib.errors import BadInput
 
 MOST = 1000  # triangles
@@ -74,16 +74,20 @@ def test_moving_file_keeps_everything_else():
 
 
 def played(content: bytes, frame: int) -> np.ndarray:
-    """Return the vertices of the only mesh in the world, at a frame, as a player computes them."""
+    """Return the vertices of all meshes in the world, at a frame, as a player computes them."""
     reader = GlbReader(content)
-    tree = reader.tree
-    node = next(n for n in tree["nodes"] if "mesh" in n)
-    primitive = tree["meshes"][node["mesh"]]["primitives"][0]
-    poses = [read_accessor(reader, target["POSITION"]) for target in primitive["targets"]]
-    sampler = tree["animations"][0]["samplers"][0]
-    weights = read_accessor(reader, sampler["output"])[:, 0].reshape(-1, len(poses))[frame]
-    moved = edited(content, lambda t: t["meshes"][node["mesh"]].update(weights=weights.tolist()))
-    return read_foreign_glb(moved, MOST).model.vertices
+
+    def pose(tree):
+        animation = tree["animations"][0]
+        for channel in animation["channels"]:
+            sampler, target = animation["samplers"][channel["sampler"]], channel["target"]
+            values = read_accessor(reader, sampler["output"])
+            keys = tree["accessors"][sampler["input"]]["count"]
+            node = tree["nodes"][target["node"]]
+            holder = tree["meshes"][node["mesh"]] if target["path"] == "weights" else node
+            holder[target["path"]] = values.reshape(keys, -1)[frame].tolist()
+
+    return read_foreign_glb(edited(content, pose), MOST).model.vertices
 
 
 @pytest.mark.parametrize("make", [box_glb, skinned_glb])
@@ -104,12 +108,87 @@ def test_vertices_of_a_skin_follow_the_joints_at_rest():
     np.testing.assert_allclose([tip, foot], [(1, 1, 0), (0, 0, 0)], atol=1e-6)  # the node's own transform is ignored
 
 
-def test_skeleton_is_kept():
-    glb = read_foreign_glb(skinned_glb(), MOST)
-    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb), 10.0, {})
+def bent(angle: float) -> np.ndarray:
+    """Return the strip with its upper joint turned about z, as a player skins it."""
+    turn = [0, 0, np.sin(angle / 2), np.cos(angle / 2)]
+    posed = edited(skinned_glb(bound=True), lambda tree: tree["nodes"][1].update(rotation=turn))
+    return read_foreign_glb(posed, MOST).model.vertices
+
+
+def targets_of(content: bytes) -> np.ndarray:
+    """Return the displacements of the first primitive's morph targets."""
+    reader = GlbReader(content)
+    primitive = reader.tree["meshes"][0]["primitives"][0]
+    return np.stack([read_accessor(reader, target["POSITION"]) for target in primitive["targets"]])
+
+
+def test_the_skeleton_moves_as_far_as_it_can():
+    glb = read_foreign_glb(skinned_glb(bound=True), MOST)
+    moved = np.stack([bent(angle) for angle in (0.0, 0.5, 1.5)])
+    content, notes = write_moving_glb(glb, np.eye(4), moved, 10.0, {})
     tree = GlbReader(content).tree
-    assert tree["skins"] == GlbReader(skinned_glb()).tree["skins"]
-    assert any("skeleton" in note for note in notes)
+    assert tree["skins"] == GlbReader(skinned_glb(bound=True)).tree["skins"]
+    assert any("skeleton" in note and "moves;" in note for note in notes)
+    assert np.abs(targets_of(content)).max() < 1e-3  # nothing is left to morph targets
+    channels = tree["animations"][0]["channels"]
+    assert {(one["target"]["node"], one["target"]["path"]) for one in channels} >= {(1, "rotation"), (2, "weights")}
+    for frame in range(3):
+        np.testing.assert_allclose(played(content, frame), moved[frame], atol=1e-5)
+
+
+def test_joints_given_as_matrices_and_meshes_that_hang_on_them_move():
+    def edit(tree):
+        tree["nodes"][1] = {
+            "name": "tip",
+            "matrix": [2.0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 1, 0, 0, 1],
+            "children": [3],
+        }
+        mesh = {"primitives": [{**tree["meshes"][0]["primitives"][0]}]}
+        mesh["primitives"][0]["attributes"] = {"POSITION": mesh["primitives"][0]["attributes"]["POSITION"]}
+        tree["meshes"].append(mesh)
+        tree["nodes"].append({"name": "held", "mesh": 1, "translation": [0.0, 0.5, 0.0]})
+
+    glb = read_foreign_glb(edited(skinned_glb(), edit), MOST)
+    rest = glb.model.vertices
+    c, s = np.cos(0.8), np.sin(0.8)
+    turned = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array([0.1, 0, 0.2])
+    moved = np.stack([rest, turned]).astype(np.float32)
+    content, notes = write_moving_glb(glb, np.eye(4), moved, 10.0, {})
+    assert any("skeleton" in note and "moves;" in note for note in notes)
+    for frame in range(2):
+        np.testing.assert_allclose(played(content, frame), moved[frame], atol=1e-5)
+    tree = GlbReader(content).tree
+    held = next(node for node in tree["nodes"] if node.get("name") == "held")
+    primitive = tree["meshes"][held["mesh"]]["primitives"][0]
+    displacement = read_accessor(GlbReader(content), primitive["targets"][1]["POSITION"])
+    assert np.abs(displacement).max() < 1e-3  # it moves with the joint that it hangs on
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (lambda t: t["nodes"][0].update(scale=[1.0, 3.0, 1.0]), "unevenly"),
+        (lambda t: t["nodes"][2].pop("skin"), "at rest"),
+    ],
+    ids=["uneven", "unused"],
+)
+def test_a_skeleton_that_cannot_move_is_kept_at_rest(edit, reason):
+    glb = read_foreign_glb(edited(skinned_glb(), edit), MOST)
+    rest = glb.model.vertices
+    above = rest[:, 1:2] > 0.5
+    moved = np.stack([rest, np.where(above, rest[:, [1, 0, 2]] * np.float32([-1, 1, 1]), rest)]).astype(np.float32)
+    content, notes = write_moving_glb(glb, np.eye(4), moved, 10.0, {})
+    assert any("skeleton" in note and reason in note for note in notes)
+    assert [one["target"]["path"] for one in GlbReader(content).tree["animations"][0]["channels"]] == ["weights"]
+    np.testing.assert_allclose(played(content, 1), moved[1], atol=1e-5)
+
+
+def test_small_skins_are_read_and_flat_ones_refused():
+    small = edited(skinned_glb(), lambda tree: tree["nodes"][0].update(scale=[1e-5] * 3))  # as of quantized meshes
+    full = read_foreign_glb(skinned_glb(), MOST).model.vertices
+    np.testing.assert_allclose(1e5 * read_foreign_glb(small, MOST).model.vertices, full, atol=1e-5)
+    with pytest.raises(BadInput, match="flattens"):
+        read_foreign_glb(edited(skinned_glb(), lambda tree: tree["nodes"][0].update(scale=[1, 0, 1])), MOST)
 
 
 def test_long_motions_have_fewer_keys():

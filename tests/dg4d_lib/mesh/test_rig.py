@@ -224,5 +224,5 @@ def test_convex_weights_are_the_best_there_are() -> None:
 
 def test_rigid_fits_undo_a_rigid_motion() -> None:
     rest, offsets = (part.double().numpy() for part in two_boxes())
-    maps = module._rigid(rest[:200], offsets[:, :200].swapaxes(0, 1), np.ones((200, 1)))
+    maps = module.rigid_maps(rest[:200], offsets[:, :200].swapaxes(0, 1), np.ones((200, 1)))
     np.testing.assert_allclose(module._displaced(rest[:200], maps[0]), offsets[:, :200].swapaxes(0, 1), atol=1e-6)

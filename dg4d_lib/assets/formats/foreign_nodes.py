@@ -1,0 +1,90 @@
+"""Nodes and skins of a glTF of another program: where its meshes are."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
+from dg4d_lib.errors import BadInput
+
+MAX_NODES = 100_000
+MAX_DEPTH = 200  # of nested nodes
+MAX_GROUPS = 4  # of four joints per vertex
+
+Matrices = dict[int, NDArray[np.float64]]  # "4 4" per node
+
+
+def global_matrices(tree: dict[str, Any]) -> Matrices:
+    """Return the global matrix of every node of the scene."""
+    nodes = tree.get("nodes", [])
+    if len(nodes) > MAX_NODES:
+        raise BadInput(f"the model has {len(nodes)} nodes; at most {MAX_NODES} are read")
+    if not tree.get("scenes"):
+        children = {child for node in nodes for child in node.get("children", ())}
+        tree["scenes"] = [{"nodes": [index for index in range(len(nodes)) if index not in children]}]
+        tree["scene"] = 0
+    found: Matrices = {}
+    waiting = [(index, np.eye(4), 1) for index in tree["scenes"][tree.get("scene", 0)].get("nodes", ())]
+    while waiting:
+        index, parent, depth = waiting.pop()
+        if index in found or depth > MAX_DEPTH:
+            raise BadInput("the nodes of the model form a circle or are nested too deeply; export it again")
+        found[index] = parent @ _local_matrix(nodes[index])
+        waiting += [(child, found[index], depth + 1) for child in nodes[index].get("children", ())]
+    return found
+
+
+def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
+    scale = 2 / max(x * x + y * y + z * z + w * w, 1e-12)
+    turn = np.array(
+        [
+            [1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)],
+            [scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)],
+            [scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), float)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def mesh_matrices(reader: GlbReader, node: int, primitive: int, globals_: Matrices) -> NDArray[np.float64]:
+    """Return the matrix from the coordinates of a mesh to the model, or one per vertex where a skeleton moves it.
+
+    Args:
+        reader: of the file.
+        node: that shows the mesh.
+        primitive: of the mesh.
+        globals_: global matrices of the nodes.
+    """
+    tree = reader.tree
+    item = tree["nodes"][node]
+    attributes = tree["meshes"][item["mesh"]]["primitives"][primitive]["attributes"]
+    if "skin" not in item or "JOINTS_0" not in attributes:
+        return globals_[node][None]
+    skin = tree["skins"][item["skin"]]
+    joints = [globals_[joint] for joint in skin["joints"]]
+    inverse = np.tile(np.eye(4), (len(joints), 1, 1))
+    if "inverseBindMatrices" in skin:
+        inverse = read_accessor(reader, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)[: len(joints)]
+    posed = np.stack(joints) @ inverse
+    indices, weights = skin_weights(reader, attributes)
+    blended: NDArray[np.float64] = np.einsum("vk,vkij->vij", weights, posed[indices])
+    blended[weights.sum(1) == 0] = np.eye(4)
+    return blended
+
+
+def skin_weights(reader: GlbReader, attributes: dict[str, int]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the joints of every vertex, as numbers in the skin, and their weights: sum 1, or 0 if none is given."""
+    groups = [group for group in range(MAX_GROUPS) if f"JOINTS_{group}" in attributes]
+    indices = [read_accessor(reader, attributes[f"JOINTS_{group}"], raw=True) for group in groups]
+    weights = [read_accessor(reader, attributes[f"WEIGHTS_{group}"]) for group in groups]
+    total = np.concatenate(weights, 1).astype(np.float64)
+    share = total.sum(1, keepdims=True)
+    broken = np.abs(share) < 1e-6
+    return np.concatenate(indices, 1).astype(np.int64), np.where(broken, 0, total / np.where(broken, 1, share))
