@@ -13,7 +13,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.fitting.rigid_parts import of_one_part_each
+from dg4d_lib.fitting.rigid_parts import keep_pieces_whole
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
@@ -73,8 +73,6 @@ def run(job: Job) -> StepReport:
     if mesh:
         mesh = replace(mesh, graph=moving_graph(mesh.graph, motion, settings.rigid_parts, mesh.surface.fine.faces))
         graph = mesh.graph.of(mesh.surface.nearest)
-    else:
-        graph = moving_graph(graph, motion, settings.rigid_parts)
     states = moved_states(cloud, graph, motion)
     deformation = framewise(cloud, states)
     write_motion(job.outputs["motion"], deformation, FramewiseSettings(), len(video), len(cloud))
@@ -92,21 +90,21 @@ def motion_note(motion: NodeMotion, most_parts: int) -> str:
 
 
 def moving_graph(
-    graph: ControlGraph, motion: NodeMotion, most_parts: int, faces: Int[np.ndarray, "f 3"] | None = None
+    graph: ControlGraph, motion: NodeMotion, most_parts: int, faces: Int[np.ndarray, "f 3"]
 ) -> ControlGraph:
-    """Return the graph by which a motion moves the points: by one part each, if it is a motion of few rigid parts.
+    """Return the graph by which a motion moves a surface: pieces stay whole if it is a motion of few rigid parts.
 
     Args:
-        graph: of the points.
+        graph: of the vertices.
         motion: of its nodes.
         most_parts: that count as few.
-        faces: of a welded surface whose vertices the points are.
+        faces: of the welded surface.
     """
     if int(motion.parts.max()) >= most_parts:
         return graph
     count = len(graph.indices)
-    pieces = None if faces is None else connected_parts(edge_graph(faces, count), np.arange(count))
-    return of_one_part_each(graph, motion.parts, None if pieces is None else torch.from_numpy(pieces).long())
+    pieces = connected_parts(edge_graph(faces, count), np.arange(count))
+    return keep_pieces_whole(graph, motion.parts, torch.from_numpy(pieces).long())
 
 
 def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:

@@ -92,26 +92,28 @@ def find_rigid_parts(
     )
 
 
-def of_one_part_each(
-    graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"] | None = None
-) -> ControlGraph:
-    """Return a graph whose points move with one rigid part each, so that nothing bends where parts meet.
+def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"]) -> ControlGraph:
+    """Return a graph by which pieces of a surface that nearly belong to one rigid part move with it alone.
+
+    They do not bend where parts meet, as a lid does not at its hinge. Pieces of several parts bend as before.
 
     Args:
         graph: weights of the nodes of several parts.
         parts: of the nodes, from 0 on.
-        pieces: connected piece of the surface that every point belongs to, from 0 on. Pieces that nearly belong to one
-            part belong to it whole; points of other pieces each to the part with the most weight.
+        pieces: connected piece of the surface that every point belongs to, from 0 on.
     """
     members = functional.one_hot(parts)
     shares = graph.blend(members.to(graph.weights)[None])[0]
-    if pieces is not None:
-        sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
-        means = sums / sums.sum(1, keepdim=True)
-        whole = (means.amax(1) > NEARLY_ONE)[pieces, None]
-        shares = torch.where(whole, means[pieces], shares)
-    first = members.argmax(0)  # any node of a part moves as the part does
-    return replace(graph, indices=first[shares.argmax(1)][:, None], weights=torch.ones_like(graph.weights[:, :1]))
+    sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
+    largest, owner = (sums / sums.sum(1, keepdim=True)).max(1)
+    whole = (largest > NEARLY_ONE)[pieces, None]
+    first = members.argmax(0)[owner][pieces, None]  # any node of a part moves as the part does
+    alone = functional.one_hot(torch.zeros_like(pieces), graph.weights.shape[1]).to(graph.weights)
+    return replace(
+        graph,
+        indices=torch.where(whole, first, graph.indices),
+        weights=torch.where(whole, alone, graph.weights),
+    )
 
 
 @dataclass(frozen=True)

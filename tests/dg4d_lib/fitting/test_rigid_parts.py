@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts, of_one_part_each
+from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts, keep_pieces_whole
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 FRAMES = 5
@@ -106,27 +106,26 @@ def test_turns_of_a_change_are_angles_about_the_center(points: torch.Tensor) -> 
     assert torch.allclose(moved[~upper], torch.tensor([0.0, 0, 0.3]).expand(16, 3), atol=1e-6)
 
 
-def test_points_between_parts_move_with_one_of_them(points: torch.Tensor) -> None:
-    graph = grid_graph(points)
-    motion = lid(graph).of_nodes(graph)
-    below, above = 15, 16  # nodes on both sides of the edge
-    between = replace(graph, indices=torch.tensor([[below, above]] * 2), weights=torch.tensor([[0.7, 0.3], [0.3, 0.7]]))
-    alone = replace(graph, indices=torch.tensor([[below], [above]]), weights=torch.ones(2, 1))
-    place = points[:1].expand(2, 3)
-    found = motion.points(place, of_one_part_each(between, motion.parts))
-    assert torch.allclose(found, motion.points(place, alone), atol=1e-6)
-    assert not torch.allclose(found, motion.points(place, between), atol=0.01)
-
-
-def test_pieces_nearly_of_one_part_are_of_that_part_whole(points: torch.Tensor) -> None:
+def test_pieces_nearly_of_one_part_move_with_it_alone(points: torch.Tensor) -> None:
     graph = grid_graph(points)
     parts = lid(graph).parts
-    owners = parts[graph.indices[:, 0]]
-    stray = torch.nonzero(owners == 1)[:3, 0]
-    most = (owners == 0).long()
-    most[stray] = 1  # a piece of the lower part with three points that the upper nodes move
-    found = parts[of_one_part_each(graph, parts, most).indices[:, 0]]
-    assert found[most == 1].tolist() == [0] * int(most.sum())
-    assert found[most == 0].tolist() == [1] * int((1 - most).sum())
-    mixed = of_one_part_each(graph, parts, torch.zeros_like(most))  # one piece of both: every point as it was
-    assert torch.equal(parts[mixed.indices[:, 0]], owners)
+    below, above = 15, 16  # nodes on both sides of the edge
+    upper = parts[graph.indices[:, 0]] == 1
+    blended = replace(
+        graph,
+        indices=torch.cat([graph.indices, torch.where(upper, below, above)[:, None]], 1),
+        weights=torch.tensor([[0.95, 0.05]]).repeat(len(points), 1),
+    )
+    blended.weights[:3] = torch.tensor([0.2, 0.8])  # three points that the other part moves
+    motion = lid(graph).of_nodes(graph)
+    whole = motion.points(points, keep_pieces_whole(blended, motion.parts, upper.long()))
+    alone = replace(graph, indices=torch.where(upper, above, below)[:, None])
+    torch.testing.assert_close(whole, motion.points(points, alone), atol=1e-6, rtol=0)
+    assert not torch.allclose(whole, motion.points(points, blended), atol=0.01)
+
+
+def test_pieces_of_several_parts_bend_as_before(points: torch.Tensor) -> None:
+    graph = grid_graph(points)
+    kept = keep_pieces_whole(graph, lid(graph).parts, torch.zeros(len(points), dtype=torch.long))
+    assert torch.equal(kept.indices, graph.indices)
+    assert torch.equal(kept.weights, graph.weights)
