@@ -7,9 +7,9 @@ import trimesh
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.fitting.asset_motion import Report, iterations
 from dg4d_lib.fitting.surface_tracking import track_surface, tracking_iterations
-from dg4d_lib.fitting.tracking_order import is_loop
+from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.inflation.render import render_surface
@@ -124,7 +124,8 @@ def test_trackings_tell_the_iterations_of_both_halves_of_a_loop() -> None:
         lambda iteration, values: told.append(iteration),
     )
     assert is_loop(video)
-    total = tracking_iterations(settings, video)
-    half = total // 2  # starts with the first frame, which is not tracked
-    skipped = settings.track_iterations
-    assert told == [*range(skipped + 1, half + 1), *range(half + skipped + 1, total + 1)]
+    halves = [iterations(settings, len(order)) for order in tracking_orders(video, 0)]
+    skipped = settings.track_iterations  # the first frame of each half is at rest, and not tracked
+    first = range(skipped + 1, halves[0] + 1)
+    assert told == [*first, *range(halves[0] + skipped + 1, sum(halves) + 1)]
+    assert told[-1] == tracking_iterations(settings, video)
