@@ -100,11 +100,11 @@ def moving_graph(
         most_parts: that count as few.
         faces: of the welded surface.
     """
-    if int(motion.parts.max()) >= most_parts:
+    parts, count = motion.parts, len(graph.indices)
+    if int(parts.max()) >= most_parts:
         return graph
-    count = len(graph.indices)
     pieces = connected_parts(edge_graph(faces, count), np.arange(count))
-    return keep_pieces_whole(graph, motion.parts, torch.from_numpy(pieces).long())
+    return keep_pieces_whole(graph, parts, torch.from_numpy(pieces).long())
 
 
 def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:

@@ -16,11 +16,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dg4d_lib.assets.formats import meshopt
-from dg4d_lib.assets.formats.foreign_nodes import Matrices, global_matrices, mesh_matrices
-from dg4d_lib.assets.formats.foreign_skeleton import SkeletonMotion, SkinnedVertices, fit_skeleton
+from dg4d_lib.assets.formats.foreign_nodes import (
+    Matrices,
+    global_matrices,
+    mesh_attributes,
+    mesh_matrices,
+    parents_of,
+    skin_of,
+    skin_weights,
+)
+from dg4d_lib.assets.formats.foreign_skeleton import (
+    JointTrack,
+    SkeletonAtRest,
+    SkeletonMotion,
+    SkinnedVertices,
+    fit_skeleton,
+)
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument, read_accessor
 from dg4d_lib.assets.formats.joint_motion import close_loop
 from dg4d_lib.assets.formats.model_pictures import decode_picture
@@ -28,9 +41,11 @@ from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.assets.formats.tracks import Animation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.tracking.rig import continuous_quats
 
 MAX_POSES = 128  # morph targets; players keep their weights in uniforms, of which every GPU has at least 256
 TRIANGLES, STRIP, FAN = 4, 5, 6
+SAMPLE = 2000  # vertices, evenly chosen, that the motion of a skeleton is fitted to
 FLAT = 1e-9  # determinant of a matrix that cannot be inverted, relative to the cube of its norm
 PLACEMENT = "dg4d placement"
 MOTION = "dg4d motion"
@@ -139,11 +154,14 @@ def write_moving_glb(
     track = np.eye(len(moved), dtype=np.float32)[np.array(keys) % len(moved)]  # the base is the model as given
     back: NDArray[np.float64] = np.linalg.inv(placement).astype(np.float64)
     animation = Animation(document, rate)
-    skeleton, about = _fitted_skeleton(glb, [_transformed(back[None], state) for state in moved])
-    notes += [about] if "skins" in tree else []
-    if skeleton is not None:
-        _animate_joints(tree, animation, skeleton, keys, interpolation)
-    posed = [skeleton.globals(frame) for frame in range(len(moved))] if skeleton else []
+    skeleton = None
+    if "skins" in tree:
+        try:
+            skeleton, tracks = _moving_skeleton(glb, moved, back)
+            _animate_joints(document, animation, skeleton.joints, tracks, keys, interpolation)
+            notes.append(MOVES)
+        except SkeletonAtRest as reason:
+            notes.append(AT_REST.format(reason))
     start = 0
     for node, pieces in _by_node(glb.pieces).items():
         mesh = {**tree["meshes"][tree["nodes"][node]["mesh"]]}
@@ -154,8 +172,7 @@ def write_moving_glb(
             states = moved[:, start : start + len(piece.local)]
             start += len(piece.local)
             primitive = mesh["primitives"][piece.primitive]
-            moving = (mesh_matrices(glb.reader, node, piece.primitive, one) for one in posed)
-            inverses = (_inverse(one) @ back for one in moving) if posed else repeat(_inverse(piece.matrices) @ back)
+            inverses = _inverses(glb, piece, skeleton, back)
             primitive["targets"] = _targets(document, piece, states, inverses, primitive, moving_normals)
         mesh["primitives"] = [one for one in mesh["primitives"] if "targets" in one]  # all need as many targets
         mesh["weights"] = track[0].tolist()
@@ -170,43 +187,63 @@ def write_moving_glb(
     return document.to_bytes(), tuple(notes)
 
 
-def _fitted_skeleton(glb: ForeignGlb, moved: Sequence[NDArray[np.float64]]) -> tuple[SkeletonMotion | None, str]:
-    """Return the motion of the model's skeleton, if it can have one, and a note on it.
+def _moving_skeleton(
+    glb: ForeignGlb, moved: NDArray[np.float32], back: NDArray[np.float64]
+) -> tuple[SkeletonMotion, list[JointTrack]]:
+    """Return the motion of the model's skeleton, and that of every joint relative to its parent.
 
     Args:
         glb: the file at rest.
-        moved: vertices of all pieces at every frame, in the coordinates of the model.
+        moved: vertices of all pieces at every frame, world units.
+        back: from the world to the coordinates of the model.
+
+    Raises:
+        SkeletonAtRest: it cannot move.
     """
     tree, start, skinned = glb.reader.tree, 0, []
-    for piece in glb.pieces:
-        rows = slice(start, start := start + len(piece.local))
-        item = tree["nodes"][piece.node]
-        attributes = tree["meshes"][item["mesh"]]["primitives"][piece.primitive]["attributes"]
-        if "skin" in item and "JOINTS_0" in attributes:
-            states = np.stack([state[rows] for state in moved])
-            skinned.append(SkinnedVertices(tree["skins"][item["skin"]], attributes, piece.part.vertices, states))
-    skeleton = fit_skeleton(glb.reader, global_matrices(tree), skinned)
-    if skeleton is None:
-        return None, AT_REST.format("it cannot move as the video shows")
-    try:
-        skeleton.tracks()
-    except ValueError:
-        return None, AT_REST.format("its nodes are scaled unevenly")
-    return skeleton, MOVES
+    skins = [skin_of(tree, piece.node, piece.primitive) for piece in glb.pieces]
+    step = max(1, sum(len(piece.local) for piece, skin in zip(glb.pieces, skins, strict=True) if skin) // SAMPLE)
+    for piece, skin in zip(glb.pieces, skins, strict=True):
+        rows = slice(start, start := start + len(piece.local), step)
+        if skin is not None:
+            indices, weights = skin_weights(glb.reader, mesh_attributes(tree, piece.node, piece.primitive))
+            states = moved[:, rows] @ back[:3, :3].T + back[:3, 3]
+            rest = piece.part.vertices[::step]
+            skinned.append(SkinnedVertices(skin["joints"], indices[::step], weights[::step], rest, states))
+    matrices = global_matrices(tree)
+    skeleton = fit_skeleton(matrices, parents_of(tree, matrices), skinned)
+    return skeleton, [skeleton.track(joint) for joint in skeleton.joints]
 
 
 def _animate_joints(
-    tree: dict[str, Any], animation: Animation, skeleton: SkeletonMotion, keys: list[int], interpolation: str
+    document: GltfDocument,
+    animation: Animation,
+    joints: Sequence[int],
+    tracks: Sequence[JointTrack],
+    keys: list[int],
+    interpolation: str,
 ) -> None:
     """Add the motion of the joints; they get translations, rotations and scales in place of matrices."""
-    for joint, (translations, turns, scale) in skeleton.tracks().items():
-        quats = Rotation.from_matrix(turns).as_quat()
-        signs = np.where((quats[1:] * quats[:-1]).sum(1) < 0, -1, 1).cumprod()
-        quats[1:] *= signs[:, None]
-        node = tree["nodes"][joint] = {key: value for key, value in tree["nodes"][joint].items() if key != "matrix"}
-        node.update(translation=translations[0].tolist(), rotation=quats[0].tolist(), scale=scale.tolist())
-        name = str(node.get("name", f"node {joint}"))
-        animation.add_transform(joint, name, keys, close_loop(translations), close_loop(quats), interpolation)
+    quats = continuous_quats(np.stack([track.rotations for track in tracks]))[..., [1, 2, 3, 0]]
+    nodes = document.tree["nodes"]
+    for number, (joint, track) in enumerate(zip(joints, tracks, strict=True)):
+        places, turns = close_loop(track.translations), close_loop(quats[:, number])
+        node = {key: value for key, value in nodes[joint].items() if key != "matrix"}
+        node.update(translation=places[0].tolist(), rotation=turns[0].tolist(), scale=track.scale.tolist())
+        nodes[joint] = node
+        animation.add_transform(joint, str(node.get("name", f"node {joint}")), keys, places, turns, interpolation)
+
+
+def _inverses(
+    glb: ForeignGlb, piece: Piece, skeleton: SkeletonMotion | None, back: NDArray[np.float64]
+) -> Iterable[NDArray[np.float64]]:
+    """Return what leads from the world to the coordinates of a piece's mesh, at every frame."""
+    if skeleton is None:
+        return repeat(_inverse(piece.matrices) @ back)
+    skin = skin_of(glb.reader.tree, piece.node, piece.primitive)
+    needed = {node: skeleton.matrices(node) for node in (skin["joints"] if skin else [piece.node])}
+    frames = ({node: moving[frame] for node, moving in needed.items()} for frame in range(len(skeleton.maps)))
+    return (_inverse(mesh_matrices(glb.reader, piece.node, piece.primitive, one)) @ back for one in frames)
 
 
 def _by_node(pieces: Sequence[Piece]) -> dict[int, list[Piece]]:

@@ -1,5 +1,6 @@
 """Nodes and skins of a glTF of another program: where its meshes are."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -62,12 +63,10 @@ def mesh_matrices(reader: GlbReader, node: int, primitive: int, globals_: Matric
         primitive: of the mesh.
         globals_: global matrices of the nodes.
     """
-    tree = reader.tree
-    item = tree["nodes"][node]
-    attributes = tree["meshes"][item["mesh"]]["primitives"][primitive]["attributes"]
-    if "skin" not in item or "JOINTS_0" not in attributes:
+    attributes = mesh_attributes(reader.tree, node, primitive)
+    skin = skin_of(reader.tree, node, primitive)
+    if skin is None:
         return globals_[node][None]
-    skin = tree["skins"][item["skin"]]
     joints = [globals_[joint] for joint in skin["joints"]]
     inverse = np.tile(np.eye(4), (len(joints), 1, 1))
     if "inverseBindMatrices" in skin:
@@ -77,6 +76,26 @@ def mesh_matrices(reader: GlbReader, node: int, primitive: int, globals_: Matric
     blended: NDArray[np.float64] = np.einsum("vk,vkij->vij", weights, posed[indices])
     blended[weights.sum(1) == 0] = np.eye(4)
     return blended
+
+
+def parents_of(tree: dict[str, Any], nodes: Iterable[int]) -> dict[int, int]:
+    """Return the parent of every node that hangs on one of these nodes."""
+    return {child: node for node in nodes for child in tree["nodes"][node].get("children", ())}
+
+
+def mesh_attributes(tree: dict[str, Any], node: int, primitive: int) -> dict[str, int]:
+    """Return the accessors of a primitive of the mesh that a node shows."""
+    attributes: dict[str, int] = tree["meshes"][tree["nodes"][node]["mesh"]]["primitives"][primitive]["attributes"]
+    return attributes
+
+
+def skin_of(tree: dict[str, Any], node: int, primitive: int) -> dict[str, Any] | None:
+    """Return the skin that moves a primitive of the mesh that a node shows, if one does."""
+    item = tree["nodes"][node]
+    if "skin" not in item or "JOINTS_0" not in mesh_attributes(tree, node, primitive):
+        return None
+    skin: dict[str, Any] = tree["skins"][item["skin"]]
+    return skin
 
 
 def skin_weights(reader: GlbReader, attributes: dict[str, int]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -3,22 +3,58 @@
 Joints keep their distances and the weights that the model gives them. What they cannot do is left to morph targets.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dg4d_lib.assets.formats.foreign_nodes import Matrices, skin_weights
-from dg4d_lib.assets.formats.gltf import GlbReader
+from dg4d_lib.assets.formats.foreign_nodes import Matrices
 from dg4d_lib.mesh.tracking.articulation import Articulation, fit_rotations
 from dg4d_lib.mesh.tracking.rig import rigid_maps
 
-SAMPLE = 2000  # vertices, evenly chosen, that the motion is fitted to
+MOST_JOINTS = 256  # more than a figure with hands and face has; the fit's time grows with their cube
 ROUNDS = 6  # of the fit, of two Gauss-Newton steps each
 CARRIED = 0.1  # of the weights below a joint that count for the rotation it starts from
 UNEVEN = 1e-3  # largest deviation from a rotation of a node's matrix without its scale
+
+
+class SkeletonAtRest(Exception):
+    """A skeleton cannot move; the message says why."""
+
+
+@dataclass(frozen=True)
+class SkinnedVertices:
+    """Vertices that joints move, in the coordinates of the model.
+
+    Attributes:
+        joints: nodes of the skin.
+        indices: joints of every vertex, as numbers in the skin.
+        weights: of these joints, sum 1 or all 0.
+        rest: vertices at rest.
+        moved: vertices at every frame.
+    """
+
+    joints: Sequence[int]
+    indices: Int[np.ndarray, "v s"]
+    weights: Float[np.ndarray, "v s"]
+    rest: Float[np.ndarray, "v 3"]
+    moved: Float[np.ndarray, "t v 3"]
+
+
+@dataclass(frozen=True)
+class JointTrack:
+    """Motion of a joint relative to its parent.
+
+    Attributes:
+        translations: at every frame.
+        rotations: matrices at every frame.
+        scale: along its axes, at all frames.
+    """
+
+    translations: Float[np.ndarray, "t 3"]
+    rotations: Float[np.ndarray, "t 3 3"]
+    scale: Float[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)
@@ -28,101 +64,82 @@ class SkeletonMotion:
     Attributes:
         rest: global matrix of every node at rest.
         parents: parent of every node that has one.
+        movers: number of the joint that every node at or below one moves with.
         joints: nodes that move, parents before their children.
         maps: from the model at rest to the model at every frame, per joint.
     """
 
     rest: Matrices
-    parents: dict[int, int]
+    parents: Mapping[int, int]
+    movers: dict[int, int]
     joints: tuple[int, ...]
     maps: Float[np.ndarray, "t k 4 4"]
 
-    def globals(self, frame: int) -> Matrices:
-        """Return the global matrix of every node at a frame; nodes below a joint move with it."""
-        mover = self._movers()
-        return {
-            node: matrix if mover[node] is None else self.maps[frame, mover[node]] @ matrix
-            for node, matrix in self.rest.items()
-        }
+    def matrices(self, node: int) -> Float[np.ndarray, "t 4 4"]:
+        """Return the global matrix of a node at every frame."""
+        if node not in self.movers:
+            return np.tile(self.rest[node], (len(self.maps), 1, 1))
+        moved: Float[np.ndarray, "t 4 4"] = self.maps[:, self.movers[node]] @ self.rest[node]
+        return moved
 
-    def tracks(self) -> dict[int, tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t 3 3"], Float[np.ndarray, " 3"]]]:
-        """Return translations, rotations and scale of every joint relative to its parent, at every frame.
+    def track(self, joint: int) -> JointTrack:
+        """Return the motion of a joint relative to its parent.
 
         Raises:
-            ValueError: the matrix of a joint is no rotation with a scale, as under parents that are scaled unevenly.
+            SkeletonAtRest: its matrix is no rotation with a scale, as below nodes that are scaled unevenly.
         """
-        frames = [self.globals(frame) for frame in range(len(self.maps))]
-        tracks = {}
-        for joint in self.joints:
-            local = np.stack([one[joint] for one in frames])
+        local = self.matrices(joint)
+        try:
             if joint in self.parents:
-                local = np.linalg.inv(np.stack([one[self.parents[joint]] for one in frames])) @ local
-            scale = np.linalg.norm(local[0, :3, :3], axis=0)
-            scale[0] *= np.sign(np.linalg.det(local[0, :3, :3]))
+                local = np.linalg.inv(self.matrices(self.parents[joint])) @ local
+        except np.linalg.LinAlgError as error:
+            raise SkeletonAtRest("a node above its joints is flat") from error
+        scale = np.linalg.norm(local[0, :3, :3], axis=0)
+        scale[0] *= np.sign(np.linalg.det(local[0, :3, :3]))
+        with np.errstate(divide="ignore", invalid="ignore"):
             turns = local[:, :3, :3] / scale
-            if not np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max() < UNEVEN:
-                raise ValueError(f"node {joint} is scaled unevenly")
-            tracks[joint] = local[:, :3, 3], turns, scale
-        return tracks
-
-    def _movers(self) -> dict[int, int | None]:
-        """Return the number of the joint that every node is, or is below of; parents come first in `rest`."""
-        number = {joint: index for index, joint in enumerate(self.joints)}
-        found: dict[int, int | None] = {}
-        for node in self.rest:
-            above = found[self.parents[node]] if node in self.parents else None
-            found[node] = number.get(node, above)
-        return found
+        if not np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max() < UNEVEN:
+            raise SkeletonAtRest("its nodes are scaled unevenly")
+        return JointTrack(local[:, :3, 3], turns, scale)
 
 
-@dataclass(frozen=True)
-class SkinnedVertices:
-    """Vertices of a primitive that joints move, in the coordinates of the model.
-
-    Attributes:
-        skin: of the node that shows the primitive.
-        attributes: of the primitive.
-        rest: vertices at rest.
-        moved: vertices at every frame.
-    """
-
-    skin: dict[str, Any]
-    attributes: dict[str, int]
-    rest: Float[np.ndarray, "v 3"]
-    moved: Float[np.ndarray, "t v 3"]
-
-
-def fit_skeleton(reader: GlbReader, rest: Matrices, skinned: Sequence[SkinnedVertices]) -> SkeletonMotion | None:
+def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[SkinnedVertices]) -> SkeletonMotion:
     """Fit rotations of the joints, and the path of the whole, to moved vertices.
 
     Args:
-        reader: of the file.
         rest: global matrix of every node, parents before their children.
-        skinned: all vertices that joints move.
+        parents: parent of every node that has one.
+        skinned: the vertices, or some of them.
 
-    Returns:
-        The motion; None if there are no joints, or if it would not show more of the motion than none.
+    Raises:
+        SkeletonAtRest: there are no or too many joints, or they would not show more of the motion than none.
     """
-    parents = {child: node for node in rest for child in reader.tree["nodes"][node].get("children", ())}
-    used = {joint for one in skinned for joint in one.skin["joints"]}
+    used = {joint for one in skinned for joint in one.joints}
     joints = tuple(node for node in rest if node in used)
-    if not joints:
-        return None
-    step = max(1, sum(len(one.rest) for one in skinned) // SAMPLE)
-    start = np.concatenate([one.rest[::step] for one in skinned]).astype(np.float64)
-    moved = np.concatenate([one.moved[:, ::step] for one in skinned], 1).swapaxes(0, 1) - start[:, None]
-    weights = np.concatenate([_weights_of_joints(reader, one, joints, step) for one in skinned])
-    weights = np.pad(weights, ((0, 0), (1, 0)))  # none of the bone that all roots hang on
-    known = weights.sum(1) > 0
-    if not known.any():
-        return None
-    still = _at_rest(rest, parents, joints, moved.shape[1])
-    maps = _fitted(still, start[known], moved[known], weights[known])
+    if len(joints) > MOST_JOINTS:
+        raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are moved")
+    number = {joint: index for index, joint in enumerate(joints)}
+    movers: dict[int, int] = {}
+    for node in rest:
+        if node in number:
+            movers[node] = number[node]
+        elif parents.get(node) in movers:
+            movers[node] = movers[parents[node]]
+    weights = [_by_joint(one, number) for one in skinned]
+    if not any(one.any() for one in weights):
+        raise SkeletonAtRest("it moves no vertex")
+    start = np.concatenate([one.rest for one in skinned]).astype(np.float64)
+    moved = np.concatenate([one.moved for one in skinned], 1).swapaxes(0, 1) - start[:, None]
+    known = np.concatenate(weights).any(1)
+    above = [movers.get(parents[joint], -1) if joint in parents else -1 for joint in joints]
+    still = _at_rest(np.stack([rest[joint][:3, 3] for joint in joints]), above, moved.shape[1])
+    padded = np.pad(np.concatenate(weights), ((0, 0), (1, 0)))  # none of the bone that all roots hang on
+    maps = _fitted(still, start[known], moved[known], padded[known])
     if maps is None:
-        return None
+        raise SkeletonAtRest("it cannot move as the video shows")
     matrices = np.tile(np.eye(4), (*maps.shape[:2], 1, 1))
     matrices[:, :, :3] += maps
-    return SkeletonMotion(rest, parents, joints, matrices[1:].swapaxes(0, 1))
+    return SkeletonMotion(rest, parents, movers, joints, matrices[1:].swapaxes(0, 1))
 
 
 def _fitted(
@@ -149,30 +166,19 @@ def _fitted(
     return maps if np.square(moved - shown).sum() < np.square(moved).sum() else None
 
 
-def _at_rest(rest: Matrices, parents: dict[int, int], joints: tuple[int, ...], frames: int) -> Articulation:
-    """Return the joints as bones at rest, below one more at their center that all roots hang on."""
-    number = {joint: index for index, joint in enumerate(joints, 1)}
-    above = []
-    for joint in joints:
-        node = parents.get(joint)
-        while node is not None and node not in number:
-            node = parents.get(node)
-        above.append(0 if node is None else number[node])
-    places = np.stack([rest[joint][:3, 3] for joint in joints])
-    places = np.concatenate([places.mean(0, keepdims=True), places])
-    still = np.tile(np.eye(3), (len(places), frames, 1, 1))
-    return Articulation(np.array([-1, *above]), places, still, np.repeat(places[:1], frames, 0))
+def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int) -> Articulation:
+    """Return joints as bones at rest, after one more at their center that all without a joint above hang on."""
+    joints = np.concatenate([places.mean(0, keepdims=True), places])
+    still = np.tile(np.eye(3), (len(joints), frames, 1, 1))
+    parents = np.array([-1, *(1 + one for one in above)])
+    return Articulation(parents, joints, still, np.repeat(joints[:1], frames, 0))
 
 
-def _weights_of_joints(
-    reader: GlbReader, skinned: SkinnedVertices, joints: tuple[int, ...], step: int
-) -> Float[np.ndarray, "n k"]:
-    """Return the weights of all joints at one vertex of every `step`."""
-    number = {joint: index for index, joint in enumerate(joints)}
-    columns: Int[np.ndarray, " s"] = np.array([number[joint] for joint in skinned.skin["joints"]])
-    indices, weights = (rows[::step] for rows in skin_weights(reader, skinned.attributes))
-    dense = np.zeros((len(indices), len(joints)))
-    np.add.at(dense, (np.arange(len(indices))[:, None], columns[indices]), weights)
+def _by_joint(skinned: SkinnedVertices, number: Mapping[int, int]) -> Float[np.ndarray, "v k"]:
+    """Return the weights of all joints at every vertex."""
+    columns = np.array([number[joint] for joint in skinned.joints])
+    dense = np.zeros((len(skinned.indices), len(number)))
+    np.add.at(dense, (np.arange(len(dense))[:, None], columns[skinned.indices]), skinned.weights)
     return dense
 
 

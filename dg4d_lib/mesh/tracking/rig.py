@@ -117,7 +117,7 @@ def fit_rig(vertices: Float[Tensor, "v 3"], offsets: Float[Tensor, "t v 3"], err
     rig = Rig(
         torch.from_numpy(joints + origin).to(vertices),
         torch.from_numpy(parents),
-        torch.from_numpy(_quaternions(rotations)).to(vertices),
+        torch.from_numpy(continuous_quats(rotations)).to(vertices),
         torch.from_numpy(positions.swapaxes(0, 1) + origin).to(vertices),
         torch.from_numpy(bones),
         torch.from_numpy(bone_weights).to(vertices),
@@ -419,8 +419,8 @@ def _largest_weights(weights: Array) -> tuple[NDArray[np.int64], Array]:
     return np.where(selected > 0, bones, 0), selected
 
 
-def _quaternions(rotations: Array) -> Array:
-    """Convert rotation matrices "k t 3 3" to quaternions "t k 4", wxyz, with w >= 0 first and then continuous signs."""
+def continuous_quats(rotations: Array) -> Array:
+    """Return rotation matrices "k t 3 3" as quaternions "t k 4", wxyz, with w >= 0 first and then continuous signs."""
     bones, frames = rotations.shape[:2]
     xyzw = Rotation.from_matrix(rotations.swapaxes(0, 1).reshape(-1, 3, 3)).as_quat(canonical=True)
     quats = xyzw[:, [3, 0, 1, 2]].reshape(frames, bones, 4)

@@ -164,13 +164,29 @@ def test_joints_given_as_matrices_and_meshes_that_hang_on_them_move():
     assert np.abs(displacement).max() < 1e-3  # it moves with the joint that it hangs on
 
 
+def hang_joints(tree, count: int) -> None:
+    """Hang joints that move no vertex on the upper one."""
+    numbers = list(range(len(tree["nodes"]), len(tree["nodes"]) + count))
+    tree["nodes"][1]["children"] = numbers
+    tree["skins"][0]["joints"] += numbers
+    tree["nodes"] += [{} for _ in numbers]
+
+
+def hang_a_joint_on_a_flat_node(tree) -> None:
+    tree["nodes"][1]["children"] = [3]
+    tree["nodes"] += [{"scale": [0.0, 1.0, 1.0], "children": [4]}, {}]
+    tree["skins"][0]["joints"].append(4)
+
+
 @pytest.mark.parametrize(
     ("edit", "reason"),
     [
         (lambda t: t["nodes"][0].update(scale=[1.0, 3.0, 1.0]), "unevenly"),
         (lambda t: t["nodes"][2].pop("skin"), "at rest"),
+        (lambda t: hang_joints(t, 255), "257 joints; at most 256"),
+        (hang_a_joint_on_a_flat_node, "flat"),
     ],
-    ids=["uneven", "unused"],
+    ids=["uneven", "unused", "too many joints", "flat"],
 )
 def test_a_skeleton_that_cannot_move_is_kept_at_rest(edit, reason):
     glb = read_foreign_glb(edited(skinned_glb(), edit), MOST)
