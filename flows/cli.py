@@ -121,7 +121,7 @@ def make(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="a model of your own that is set in motion: .glb, .gltf, .obj, .usdz, or splats as .ply, .spz",
+            help="a model of your own that is set in motion: .glb, .gltf, .obj, .usdz, .ply, or splats as .ply, .spz",
         ),
     ] = None,
     asset_azimuth: Annotated[

@@ -136,6 +136,25 @@ def parse_header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], i
     Raises:
         BadInput: it is no binary PLY of one element `vertex`.
     """
+    elements, start = parse_elements(name, beginning)
+    if [kind for kind, _, _ in elements] != ["vertex"]:
+        raise BadInput(
+            f"{name} must hold one element, 'vertex'; given {[(kind, count) for kind, count, _ in elements]}"
+        )
+    _, count, dtype = elements[0]
+    return count, dtype, start
+
+
+def parse_elements(name: str, beginning: bytes) -> tuple[list[tuple[str, int, np.dtype[np.void]]], int]:
+    """Return name, number of rows and row type of every element, in order, and the offset of the first row.
+
+    Args:
+        name: of the file, for messages.
+        beginning: first bytes of the file.
+
+    Raises:
+        BadInput: it is no binary PLY, or has properties of varying length.
+    """
     end = beginning.find(b"end_header\n")
     if not beginning.startswith(b"ply\n") or end < 0:
         raise BadInput(f"{name} is no PLY: it must start with 'ply' and have an 'end_header' line")
@@ -143,12 +162,16 @@ def parse_header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], i
     lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise BadInput(f"{name} must be 'format binary_little_endian 1.0'; export it in that format")
+    found: list[tuple[str, int, list[tuple[str, str]]]] = []
     try:
-        elements = [(words[1], int(words[2])) for words in lines if words[0] == "element"]
-        properties = [(words[2], _TYPES[words[1]]) for words in lines if words[0] == "property"]
-        (kind, count), dtype = elements[0], np.dtype(properties)
+        for words in lines:
+            if words[0] == "element":
+                found.append((words[1], int(words[2]), []))
+            elif words[0] == "property":
+                found[-1][2].append((words[2], _TYPES[words[1]]))
+        elements = [(kind, count, np.dtype(properties)) for kind, count, properties in found]
     except (IndexError, KeyError, ValueError) as error:
         raise BadInput(f"{name} has a header that cannot be read: {error!r}") from error
-    if len(elements) != 1 or kind != "vertex" or count < 0:
-        raise BadInput(f"{name} must hold one element, 'vertex'; given {elements}")
-    return count, dtype, end + len(b"end_header\n")
+    if any(count < 0 for _, count, _ in elements):
+        raise BadInput(f"{name} has a header that cannot be read: a negative number of rows")
+    return elements, end + len(b"end_header\n")

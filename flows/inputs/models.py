@@ -2,12 +2,14 @@
 
 import itertools
 import json
+import os.path
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from dg4d_lib.assets.formats.mtl import read_mtl
 from dg4d_lib.errors import BadInput
 from flows.inputs import json_text
 from flows.inputs.sources import LARGEST_FILE_BYTES, put_zip, resolve_inside
@@ -16,11 +18,12 @@ from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
 
 FORMATS = (".glb", ".gltf", ".obj", ".usdz", ".ply", ".spz")
-MAGIC = {".glb": b"glTF", ".usdz": b"PK", ".ply": b"ply", ".spz": b"\x1f\x8b"}
+MAGIC = {".glb": (b"glTF",), ".usdz": (b"PK",), ".ply": (b"ply",), ".spz": (b"\x1f\x8b", b"NGSP")}
 MOST_REFERENCES = 256  # files that a model may refer to
 LARGEST_TEXT_BYTES = 256 * 2**20  # of a glTF or MTL, which is searched for references
+PLY_HEADER_BYTES = 65536
+_PLY_TEXTURE = re.compile(r"^comment TextureFile\s+(.+?)\s*$", re.MULTILINE)
 _MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
-_TEXTURES = re.compile(r"^\s*map_Kd\s+(?:.*\s)?(\S+)\s*$", re.MULTILINE)
 
 
 def check_model(path: Path) -> None:
@@ -40,7 +43,7 @@ def check_model(path: Path) -> None:
         raise BadInput(f"--asset: {path} has {size} bytes; 1 to {LARGEST_FILE_BYTES} are read")
     with path.open("rb") as file:
         beginning = file.read(8)
-    if not beginning.startswith(MAGIC.get(suffix, b"")):
+    if not beginning.startswith(MAGIC.get(suffix, (b"",))):
         raise BadInput(f"--asset: {path} does not start as a {suffix} file does ({beginning!r}); export it again")
 
 
@@ -59,7 +62,7 @@ def put_model(path: Path, store: ArtifactStore) -> ArtifactRef:
     for name in dict.fromkeys(itertools.islice(_references(path, suffix), MOST_REFERENCES)):
         cleaned = name.replace("\\", "/").removeprefix("./")
         file = resolve_inside(path.parent, cleaned, "the file of the model")
-        if file.is_file():
+        if os.path.isfile(file):  # noqa: PTH113 (Path.is_file raises OSError if the name is too long)
             files.setdefault(cleaned, file)
     size = sum(file.stat().st_size for file in files.values())
     if size > LARGEST_FILE_BYTES:
@@ -68,17 +71,27 @@ def put_model(path: Path, store: ArtifactStore) -> ArtifactRef:
 
 
 def _references(path: Path, suffix: str) -> Iterator[str]:
-    """List the files that a glTF or an OBJ refers to."""
+    """List the files that a glTF, an OBJ or a PLY refers to."""
     if suffix == ".gltf":
         yield from _uris(_parsed(path))
     elif suffix == ".obj":
-        for materials in _MATERIALS.findall(_text(path)):
-            yield materials
-            file = path.parent / materials
-            if file.is_file():
-                resolve_inside(path.parent, materials, "the file of the model")
-                folder = Path(materials).parent.as_posix()
-                yield from _TEXTURES.findall(_text(file)) if folder == "." else ()
+        for name in _MATERIALS.findall(_text(path)):
+            yield name
+            materials = path.parent / name
+            if os.path.isfile(materials):  # noqa: PTH113 (any length of the name)
+                resolve_inside(path.parent, name, "the file of the model")
+                yield from _textures(materials)
+    elif suffix == ".ply":
+        with path.open("rb") as file:
+            yield from _PLY_TEXTURE.findall(file.read(PLY_HEADER_BYTES).decode("utf-8", "replace"))
+
+
+def _textures(file: Path) -> Iterator[str]:
+    try:
+        for material in read_mtl(_text(file)).values():
+            yield from material.textures
+    except ValueError as error:
+        raise BadInput(f"--asset: {file} is no MTL: {error}; export the model again") from error
 
 
 def _uris(tree: Any) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Reader of users' models: GLB, glTF, OBJ and USDZ meshes become one GLB; PLY and SPZ become Gaussians.
+"""Reader of users' models: GLB, glTF, OBJ, USDZ and PLY meshes become one GLB; splats (PLY, SPZ) become Gaussians.
 
 A model arrives as a zip: `model.SUFFIX` and the files that it refers to, beside it or in folders below.
 """
@@ -6,6 +6,7 @@ A model arrives as a zip: `model.SUFFIX` and the files that it refers to, beside
 import base64
 import binascii
 import json
+import os.path
 import struct
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,6 +20,7 @@ from dg4d_lib.assets.formats.foreign_splats import read_foreign_ply, read_spz
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.obj import read_obj
+from dg4d_lib.assets.formats.ply_mesh import declared_faces, read_ply_mesh
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from steps.artifacts.archives import stays_inside, unpack
@@ -74,8 +76,7 @@ def read_model(path: Path, scratch: Path, settings: AssetSettings, max_decode_gb
 def _read(file: Path, settings: AssetSettings) -> OwnModel:
     match file.suffix:
         case ".ply":
-            splats, notes = read_foreign_ply(file.read_bytes(), settings.max_splats)
-            return OwnModel(splats=splats, ups=("y", "-y", "z"), notes=notes)
+            return _ply(file.read_bytes(), file.parent, settings)
         case ".spz":
             splats, notes = read_spz(file.read_bytes(), settings.max_splats)
             return OwnModel(splats=splats, ups=("y", "-y"), notes=notes)
@@ -93,6 +94,15 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             return _mesh(write_model_glb(usd.read_usd(file, decode_picture, settings.max_faces)), settings)
 
 
+def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
+    """Return a mesh where the file has faces, and splats where it has none."""
+    if declared_faces(content):
+        model = read_ply_mesh(content, lambda name: _beside(folder, name), decode_picture, settings.max_faces)
+        return _mesh(write_model_glb(model), settings, ("y", "z"))
+    splats, notes = read_foreign_ply(content, settings.max_splats)
+    return OwnModel(splats=splats, ups=("-y", "y", "z"), notes=notes)  # 3DGS has y down
+
+
 def _mesh(content: bytes, settings: AssetSettings, ups: tuple[str, ...] = ("y",)) -> OwnModel:
     glb = read_foreign_glb(content, settings.max_faces)
     return OwnModel(content=content, glb=glb, ups=ups, notes=glb.notes)
@@ -101,7 +111,7 @@ def _mesh(content: bytes, settings: AssetSettings, ups: tuple[str, ...] = ("y",)
 def _beside(folder: Path, name: str) -> bytes | None:
     """Return the content of a file beside the model; None if there is none."""
     cleaned = name.replace("\\", "/").removeprefix("./")
-    if not stays_inside(cleaned) or not (folder / cleaned).is_file():
+    if not stays_inside(cleaned) or not os.path.isfile(folder / cleaned):  # noqa: PTH113 (any length of the name)
         return None
     return (folder / cleaned).read_bytes()
 

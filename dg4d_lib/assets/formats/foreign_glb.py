@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats import meshopt
+from dg4d_lib.assets.formats import draco, meshopt
 from dg4d_lib.assets.formats.foreign_nodes import (
     Matrices,
     global_matrices,
@@ -52,9 +52,11 @@ MOTION = "dg4d motion"
 MOVES = "the skeleton of the model moves; what it cannot do is in morph targets"
 AT_REST = "the skeleton of the model is kept at rest, for {}; morph targets have the motion"
 UNREADABLE = {
-    "KHR_draco_mesh_compression": "its meshes are compressed with Draco; export it without compression",
+    "EXT_mesh_gpu_instancing": "it has one mesh at many places (EXT_mesh_gpu_instancing); export it without instancing",
+    "KHR_meshopt_compression": "it is compressed with KHR_meshopt_compression; export it without compression",
     "KHR_texture_basisu": "its textures are in KTX2; export them as PNG or JPEG",
 }
+SPECULAR = "KHR_materials_pbrSpecularGlossiness"  # materials of older exporters
 _FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, AttributeError, OSError, struct.error)
 
 
@@ -329,6 +331,7 @@ def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
     for extension, remedy in UNREADABLE.items():
         if extension in tree.get("extensionsRequired", ()):
             raise BadInput(f"the model cannot be read: {remedy}")
+    draco.unpack_draco(reader)
     globals_ = global_matrices(tree)
     nodes = [n for n in sorted(globals_) if "mesh" in tree["nodes"][n]]
     faces, notes = 0, []
@@ -381,7 +384,7 @@ def _piece(
         raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
     faces = _faces(reader, primitive, count)
     material = tree["materials"][primitive["material"]] if "material" in primitive else {}
-    shading = _object(material.get("pbrMetallicRoughness"))
+    shading = _base_color(material)
     texture, uvs = _texture(reader, shading.get("baseColorTexture"), attributes, pictures)
     colors = read_accessor(reader, attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
     factor = [float(value) for value in shading.get("baseColorFactor", (1, 1, 1, 1))]
@@ -418,6 +421,15 @@ def _faces(reader: GlbReader, primitive: dict[str, Any], count: int) -> NDArray[
             return strip
         case _:
             return np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], 1)
+
+
+def _base_color(material: dict[str, Any]) -> dict[str, Any]:
+    """Return the shading of a material by metal and roughness, or what equals its base color in an older one."""
+    specular = _object(_object(material.get("extensions")).get(SPECULAR))
+    if "pbrMetallicRoughness" in material or not specular:
+        return _object(material.get("pbrMetallicRoughness"))
+    renamed = {"diffuseFactor": "baseColorFactor", "diffuseTexture": "baseColorTexture"}
+    return {renamed[key]: value for key, value in specular.items() if key in renamed}
 
 
 def _texture(

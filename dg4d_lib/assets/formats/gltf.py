@@ -16,7 +16,7 @@ MAX_LENGTH = 2**32 - 1  # maximum size of a GLB, bytes
 
 _MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
 _ALIGNMENT = 4  # of vertices and buffer views, bytes
-_COMPONENTS: dict[int, np.dtype[Any]] = {
+COMPONENTS: dict[int, np.dtype[Any]] = {
     5120: np.dtype("i1"),
     5121: np.dtype("u1"),
     5122: np.dtype("<i2"),
@@ -24,7 +24,7 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-_COMPONENT_OF = {dtype: number for number, dtype in _COMPONENTS.items()}
+COMPONENT_OF = {dtype: number for number, dtype in COMPONENTS.items()}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TYPE_OF = {width: kind for kind, width in _WIDTHS.items()}
 
@@ -102,7 +102,7 @@ class GltfDocument:
             "accessors",
             name=name,
             bufferView=add(name, rows, target),
-            componentType=_COMPONENT_OF[rows.dtype],
+            componentType=COMPONENT_OF[rows.dtype],
             normalized=normalized or None,
             count=len(rows),
             type=_TYPE_OF[rows.shape[1]],
@@ -134,7 +134,7 @@ class GltfDocument:
         return _MAGIC + struct.pack("<II", 2, length) + chunks
 
     def _add_plain_view(self, name: str, rows: NDArray[Any], target: int | None) -> int:
-        padded = _padded(rows) if target == VERTEX_DATA else rows
+        padded = padded_rows(rows) if target == VERTEX_DATA else rows
         stride = padded[0].nbytes if padded.shape != rows.shape else None
         return self.add_view(name, padded.tobytes(), target, stride)
 
@@ -142,7 +142,7 @@ class GltfDocument:
         """Append a compressed view: a view of the fallback buffer, and the location of the compressed bytes."""
         self.use_extension(meshopt.EXTENSION, required=True)
         vertices = target == VERTEX_DATA
-        padded = _padded(rows) if vertices else rows
+        padded = padded_rows(rows) if vertices else rows
         content = meshopt.pack_vertices(padded) if vertices else meshopt.pack_triangles(padded)
         number = self.add_view(name, content)
         view = self.tree["bufferViews"][number]
@@ -203,7 +203,7 @@ class GlbReader:
     def accessor(self, index: int) -> NDArray[Any]:
         """Return rows of numbers, "n k"; normalized integers are converted to float32."""
         accessor = self.tree["accessors"][index]
-        dtype, width = _COMPONENTS[accessor["componentType"]], _WIDTHS[accessor["type"]]
+        dtype, width = COMPONENTS[accessor["componentType"]], _WIDTHS[accessor["type"]]
         stride = self.tree["bufferViews"][accessor["bufferView"]].get("byteStride", width * dtype.itemsize)
         rows: NDArray[Any] = np.ndarray(
             (accessor["count"], width),
@@ -221,7 +221,7 @@ class GlbReader:
         return self.binary[start : start + location["byteLength"]]
 
 
-def _padded(rows: NDArray[Any]) -> NDArray[Any]:
+def padded_rows(rows: NDArray[Any]) -> NDArray[Any]:
     """Pad rows with zeros to whole words."""
     missing = -rows[0].nbytes % _ALIGNMENT // rows.itemsize
     return np.pad(rows, ((0, 0), (0, missing))) if missing else rows
@@ -235,7 +235,7 @@ def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[A
     """
     tree = reader.tree
     accessor = tree["accessors"][index]
-    kind = _COMPONENTS[accessor["componentType"]]
+    kind = COMPONENTS[accessor["componentType"]]
     width = (_WIDTHS | {"MAT4": 16})[accessor["type"]]
     count = int(accessor["count"])
     if not 0 <= count <= 50_000_000:

@@ -1,5 +1,6 @@
 """OBJ reader: a part per object and material, polygons as fans of triangles, textures of the MTL files beside it."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -7,19 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from dg4d_lib.assets.formats.mtl import Material, read_mtl
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
 
 Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
-
-
-@dataclass
-class _Material:
-    """Base color of a material."""
-
-    color: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    texture: str = ""
+_CONTINUED = re.compile(r"\\\r?\n")  # a backslash at the end of a line
 
 
 @dataclass
@@ -44,7 +39,7 @@ def read_obj(text: str, read: Read, decode: Decode, max_faces: int) -> Model:
         BadInput: numbers cannot be read or do not fit, there are no or too many triangles, or a texture is missing.
     """
     content = _Content(read, max_faces)
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_CONTINUED.sub(" ", text).splitlines(), 1):
         words = line.split("#", 1)[0].split()
         try:
             content.add(words)
@@ -61,8 +56,9 @@ class _Content:
     def __init__(self, read: Read, max_faces: int) -> None:
         self.read, self.max_faces = read, max_faces
         self.positions: list[tuple[float, ...]] = []
+        self.colors: list[tuple[float, ...]] = []  # of the positions; empty where a line has none
         self.uvs: list[tuple[float, float]] = []
-        self.materials: dict[str, _Material] = {}
+        self.materials: dict[str, Material] = {}
         self.groups: dict[tuple[str, str], _Group] = {}
         self.name, self.material, self.faces = "model", "", 0
 
@@ -70,7 +66,9 @@ class _Content:
         """Read the words of a line."""
         match words[:1]:
             case ["v"]:
-                self.positions.append(tuple(map(float, words[1:7])))
+                x, y, z = map(float, words[1:4])
+                self.positions.append((x, y, z))
+                self.colors.append(tuple(map(float, words[4:7])))
             case ["vt"]:
                 self.uvs.append((float(words[1]), 1 - float(words[2])))
             case ["o" | "g"]:
@@ -78,7 +76,8 @@ class _Content:
             case ["usemtl"]:
                 self.material = " ".join(words[1:])
             case ["mtllib"]:
-                _read_materials(self.read(" ".join(words[1:])), self.materials)
+                content = self.read(" ".join(words[1:]))  # without it materials are gray, as in players
+                self.materials |= read_mtl((content or b"").decode("utf-8", "replace"))
             case ["f"]:
                 self.add_face([_corner(word, len(self.positions), len(self.uvs)) for word in words[1:]])
 
@@ -97,70 +96,64 @@ class _Content:
 
     def model(self, decode: Decode) -> Model:
         """Return the parts."""
-        points = np.array([row[:3] for row in self.positions], float).reshape(-1, 3)
-        colored = None
-        if all(len(row) == 6 for row in self.positions):
-            colored = np.array([row[3:6] for row in self.positions])
+        with np.errstate(over="ignore"):
+            points = np.array(self.positions, np.float64).astype(np.float32).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
+        colored = np.array(self.colors, float) if all(len(row) == 3 for row in self.colors) else None
+        if colored is not None and not np.isfinite(colored).all():
+            colored = None
         coordinates = np.array(self.uvs, float).reshape(-1, 2)
         pictures: dict[str, NDArray[np.uint8]] = {}
         parts = []
         for group in self.groups.values():
             if group.corners:
-                known = self.materials.get(group.material, _Material())
-                texture = _texture(known.texture, self.read, decode, pictures)
+                known = self.materials.get(group.material, Material())
+                texture = _texture(known.textures, self.read, decode, pictures)
                 parts.append(_part(group, points, coordinates, colored, known, texture))
         return Model(tuple(parts))
 
 
 def _corner(word: str, positions: int, uvs: int) -> tuple[int, int]:
-    """Return the indices of one corner, written as v, v/vt, v//vn or v/vt/vn, from 1 or backwards from -1."""
+    """Return the indices of one corner, written as v, v/vt, v//vn or v/vt/vn, from 1 or backwards from -1.
+
+    Texture coordinates that are not there are left out, as players do.
+    """
     fields = word.split("/")
-    place = _index(fields[0], positions)
-    uv = _index(fields[1], uvs) if len(fields) > 1 and fields[1] else -1
-    return place, uv
+    place, uv = _index(fields[0], positions), _index(fields[1], uvs) if len(fields) > 1 and fields[1] else -1
+    if not 0 <= place < positions:
+        raise ValueError(f"the index {fields[0]} is out of range: {positions} are defined so far")
+    return place, uv if 0 <= uv < uvs else -1
 
 
 def _index(text: str, count: int) -> int:
+    """Return the index from 0 of one from 1, or backwards from -1; 0 and what lies before the first are negative."""
     value = int(text)
-    index = value - 1 if value > 0 else count + value
-    if value == 0 or not 0 <= index < count:
-        raise ValueError(f"the index {value} is out of range: {count} are defined so far")
-    return index
+    return value - 1 if value >= 0 else count + value
 
 
-def _read_materials(content: bytes | None, materials: dict[str, _Material]) -> None:
-    """Add the materials of an MTL; a missing one leaves its materials gray, as players do."""
-    current = _Material()
-    for line in (content or b"").decode("utf-8", "replace").splitlines():
-        words = line.split("#", 1)[0].split()
-        if words[:1] == ["newmtl"]:
-            current = materials[" ".join(words[1:])] = _Material()
-        elif words[:1] == ["Kd"] and len(words) >= 4:
-            red, green, blue = map(float, words[1:4])
-            current.color = (red, green, blue)
-        elif words[:1] == ["map_Kd"] and len(words) > 1:
-            current.texture = words[-1].replace("\\", "/")
-
-
-def _texture(name: str, read: Read, decode: Decode, pictures: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
-    if not name:
-        return None
-    if name not in pictures:
-        content = read(name)
-        if content is None:
-            raise BadInput(f"the texture {name[:80]!r} of the model is missing; put it beside the model")
-        pictures[name] = decode(content, name)
-    return pictures[name]
+def _texture(
+    names: tuple[str, ...], read: Read, decode: Decode, pictures: dict[str, NDArray[np.uint8]]
+) -> NDArray[np.uint8] | None:
+    """Return the picture of the first of the names that is there, None without names."""
+    for name in names:
+        if name not in pictures:
+            content = read(name)
+            if content is None:
+                continue
+            pictures[name] = decode(content, name)
+        return pictures[name]
+    if names:
+        raise BadInput(f"the texture {names[-1][:80]!r} of the model is missing; put it beside the model")
+    return None
 
 
 def _part(
     group: _Group,
-    points: NDArray[np.float64],
+    points: NDArray[np.float32],
     uvs: NDArray[np.float64],
     colors: NDArray[np.float64] | None,
-    material: _Material,
+    material: Material,
     texture: NDArray[np.uint8] | None,
 ) -> ModelPart:
     pairs, faces = np.unique(np.array(group.corners), axis=0, return_inverse=True)
@@ -168,7 +161,7 @@ def _part(
     factor = (1.0, 1.0, 1.0) if texture is not None else tuple(map(float, to_linear(np.array(material.color))))
     return ModelPart(
         f"{group.name} {group.material}".strip(),
-        points[pairs[:, 0]].astype(np.float32),
+        points[pairs[:, 0]],
         faces.reshape(-1, 3),
         uvs[pairs[:, 1]] if textured else None,
         texture if textured else None,

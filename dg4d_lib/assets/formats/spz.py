@@ -2,8 +2,7 @@
 
 All positions, opacities, colors, scales and rotations are integers, in this order. Version 3 is one gzip stream of a
 header of 16 bytes and these sections. Version 4 has a header of 32 bytes, a table of the sizes of its streams, and a
-Zstandard frame per section; ours hold the bytes as they are, because Python has no Zstandard before 3.14, so that these
-files are larger. The axes equal ours (x right, y up, z towards the viewer).
+Zstandard frame per section. The axes equal ours (x right, y up, z towards the viewer).
 """
 
 import gzip
@@ -14,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+import zstandard
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
@@ -29,9 +29,7 @@ SMALL = 0.5  # meters; smaller clouds get more bits, so that positions remain as
 MAX_BITS = 20
 LARGEST_POSITION = 2**23 - 1  # positions are signed 24-bit integers
 SPZ4_HEADER = 32  # bytes
-ZSTD_MAGIC, ZSTD_HEADER = 0xFD2FB528, 0xE0  # a frame of one segment with its size in 8 bytes
-ZSTD_BLOCK = 2**17  # maximum size of a block, bytes
-LEVEL = 9  # of gzip
+LEVEL, ZSTD_LEVEL = 9, 19  # of gzip and of Zstandard
 LARGEST = 2**9 - 1  # largest magnitude of a quantized quaternion component, without its sign
 
 
@@ -68,21 +66,10 @@ def write_spz(path: Path, gaussians: Gaussians, version: SpzVersion = 3) -> None
     if version == 3:
         path.write_bytes(gzip.compress(common + bytes(1) + b"".join(streams), LEVEL, mtime=0))
         return
-    frames = [_zstd_frame(stream) for stream in streams]
+    frames = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(frame), len(stream)) for frame, stream in zip(frames, streams, strict=True))
     header = common + struct.pack("<BI12x", len(streams), SPZ4_HEADER)
     path.write_bytes(header + table + b"".join(frames))
-
-
-def _zstd_frame(content: bytes) -> bytes:
-    """Wrap bytes as a Zstandard frame (RFC 8878) of raw blocks."""
-    starts = range(0, max(1, len(content)), ZSTD_BLOCK)
-    parts = [struct.pack("<IBQ", ZSTD_MAGIC, ZSTD_HEADER, len(content))]
-    for start in starts:
-        block = content[start : start + ZSTD_BLOCK]
-        is_last = start == starts[-1]
-        parts += [(len(block) << 3 | is_last).to_bytes(3, "little"), block]
-    return b"".join(parts)
 
 
 def _array(values: torch.Tensor) -> NDArray[Any]:

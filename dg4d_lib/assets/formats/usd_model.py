@@ -5,18 +5,20 @@ that a small file cannot grow.
 """
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Ar, Usd, UsdGeom, UsdShade
+from pxr import Ar, Gf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
 
-MAX_ENTRIES = 1000
+MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
+GRAY = (0.5, 0.5, 0.5)  # of a material without a readable color, linear
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 
 
@@ -42,7 +44,9 @@ def check_usdz(path: Path) -> None:
 
 
 def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
-    """Read the visible meshes of a USDZ, at its first time, in meters' axes with y up.
+    """Read the visible meshes of a USDZ, at its first time, y up; a part per mesh and material.
+
+    Skeletons pose their meshes, and meshes of instances are read at every place.
 
     Args:
         path: file that `check_usdz` accepted.
@@ -58,25 +62,28 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
         raise BadInput(f"the USD file cannot be read ({str(error)[:200]}); export it again") from error
     if stage is None:
         raise BadInput("the USD file cannot be read; export it again")
-    time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.Default()
+    package = stage.GetRootLayer().realPath
+    if any(not layer.realPath.startswith(package) for layer in stage.GetUsedLayers() if not layer.anonymous):
+        raise BadInput("the USD file refers to files outside of its package; pack them into the USDZ")
+    start = stage.GetStartTimeCode()
+    stage.SetEditTarget(stage.GetSessionLayer())
+    UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(start))
+    time, upright = Usd.TimeCode(start), np.eye(3)
     cache = UsdGeom.XformCache(time)
-    upright = np.eye(3)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         upright = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    parts, faces = [], 0
-    for prim in stage.Traverse():
+    parts: list[ModelPart] = []
+    for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
+        if number >= MAX_PRIMS:
+            raise BadInput(f"the USD file has more than {MAX_PRIMS} objects; simplify it")
         if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
-        part = _part(UsdGeom.Mesh(prim), time, cache, upright, decode)
-        if part is None:
-            continue
-        faces += len(part.faces)
-        if faces > max_faces:
+        parts += _parts(UsdGeom.Mesh(prim), time, cache, upright, partial(_picture, package, decode))
+        if sum(len(part.faces) for part in parts) > max_faces:
             raise BadInput(
                 f"the model has more than {max_faces} triangles, the limit asset.max_faces: simplify it, or raise the "
                 "limit with --set asset.max_faces=N"
             )
-        parts.append(part)
     if not parts:
         raise BadInput("the USD file shows no triangles; give a mesh with faces")
     if not all(np.isfinite(part.vertices).all() for part in parts):
@@ -84,36 +91,62 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     return Model(tuple(parts))
 
 
-def _part(mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], decode: Decode) -> ModelPart | None:
+def _parts(
+    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], read: Callable[[Any], NDArray[np.uint8]]
+) -> Iterator[ModelPart]:
+    """Return a part for every material of a mesh."""
+    prim = mesh.GetPrim()
     points = np.array(mesh.GetPointsAttr().Get(time) or [], float).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
     indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
     if not len(counts) or counts.min() < 3:
-        return None
+        return
     if counts.sum() != len(indices) or indices.min() < 0 or indices.max() >= len(points):
         raise BadInput("the faces of a mesh in the USD file do not fit its points; export it again")
     corners = _fans(counts)  # three positions in `indices` per triangle
     if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
         corners = corners[:, ::-1]
-    uvs = _per_corner(mesh.GetPrim(), ("st", "UVMap", "st0"), indices, time)
-    colors = _per_corner(mesh.GetPrim(), ("displayColor",), indices, time)
-    texture, factor = _material(mesh.GetPrim(), decode)
-    rows = [indices[:, None].astype(float)] + [values for values in (uvs, colors) if values is not None]
-    unique, faces = np.unique(np.concatenate(rows, 1), axis=0, return_inverse=True)
-    matrix = np.array(cache.GetLocalToWorldTransform(mesh.GetPrim()))  # row vectors
-    placed = points @ matrix[:3, :3] + matrix[3, :3]
-    split = unique[:, 0].astype(np.int64)
-    width = 0 if uvs is None else 2
-    textured = uvs is not None and texture is not None
-    return ModelPart(
-        mesh.GetPrim().GetName(),
-        (placed @ upright.T)[split].astype(np.float32),
-        faces.ravel()[corners],
-        np.stack([unique[:, 1], 1 - unique[:, 2]], 1) if textured else None,
-        texture if textured else None,
-        (1.0, 1.0, 1.0) if textured or colors is not None else factor,
-        unique[:, 1 + width :] if colors is not None and not textured else None,
-    )
+    names = [primvar.GetPrimvarName() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars() if _is_uv(primvar)]
+    uvs = _per_corner(prim, ("st", "UVMap", "st0", *names), indices, time)
+    colors = _per_corner(prim, ("displayColor",), indices, time)
+    matrix = np.array(cache.GetLocalToWorldTransform(prim))  # row vectors
+    placed = ((points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T).astype(np.float32)
+    polygons = np.repeat(np.arange(len(counts)), counts - 2)  # of the triangles
+    for owner, chosen in _faces_by_material(mesh, len(counts), time):
+        triangles = corners[chosen[polygons]]
+        if not len(triangles):
+            continue
+        color = _material(owner, read)
+        shown = colors if color is None else None
+        texture, factor = (None, GRAY if shown is None else (1.0, 1.0, 1.0)) if color is None else color
+        coordinates = uvs if texture is not None else None
+        rows = [indices[:, None].astype(float), *(values for values in (coordinates, shown) if values is not None)]
+        unique, faces = np.unique(np.concatenate(rows, 1)[triangles.ravel()], axis=0, return_inverse=True)
+        yield ModelPart(
+            prim.GetName() if owner == prim else f"{prim.GetName()} {owner.GetName()}",
+            placed[unique[:, 0].astype(np.int64)],
+            faces.reshape(-1, 3),
+            None if coordinates is None else np.stack([unique[:, 1], 1 - unique[:, 2]], 1),
+            None if coordinates is None else texture,
+            (1.0, 1.0, 1.0) if coordinates is not None else factor,
+            None if shown is None else unique[:, 1:],
+        )
+
+
+def _faces_by_material(mesh: UsdGeom.Mesh, count: int, time: Any) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+    """Return the subsets of a mesh with materials of their own, and the mesh for the rest, each with its faces."""
+    rest = np.ones(count, bool)
+    for subset in UsdShade.MaterialBindingAPI(mesh.GetPrim()).GetMaterialBindSubsets():
+        listed = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
+        chosen = np.zeros(count, bool)
+        chosen[listed[(listed >= 0) & (listed < count)]] = True
+        yield subset.GetPrim(), chosen & rest
+        rest &= ~chosen
+    yield mesh.GetPrim(), rest
+
+
+def _is_uv(primvar: Any) -> bool:
+    return str(primvar.GetTypeName()) in ("texCoord2f[]", "texCoord2d[]", "texCoord2h[]", "float2[]")
 
 
 def _fans(counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -142,25 +175,27 @@ def _per_corner(prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], t
     return None
 
 
-def _material(prim: Any, decode: Decode) -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]]:
-    """Return the base color texture, if there is one, and the linear base color."""
-    gray = (0.5, 0.5, 0.5)
+def _material(
+    prim: Any, read: Callable[[Any], NDArray[np.uint8]]
+) -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]] | None:
+    """Return the base color texture and the linear base color of a prim's material; None if it has no color."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    if not material:
-        return None, gray
-    shader, _, _ = material.ComputeSurfaceSource()
+    shader = material.ComputeSurfaceSource()[0] if material else None
     color = shader.GetInput("diffuseColor") if shader else None
     if not color:
-        return None, gray
+        return None
     if not color.HasConnectedSource():
         value = color.Get()
-        return None, gray if value is None else (float(value[0]), float(value[1]), float(value[2]))
-    source = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim())
-    file = source.GetInput("file")
+        return None if value is None else (None, (float(value[0]), float(value[1]), float(value[2])))
+    file = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim()).GetInput("file")
     picture = file.Get() if file else None
-    if picture is None:
-        return None, gray
-    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(picture.resolvedPath)) if picture.resolvedPath else None
+    return None if picture is None else (read(picture), GRAY)
+
+
+def _picture(package: str, decode: Decode, picture: Any) -> NDArray[np.uint8]:
+    """Return a texture in the package."""
+    inside = picture.resolvedPath.startswith(f"{package}[")
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(picture.resolvedPath)) if inside else None
     if asset is None:
         raise BadInput(f"the texture {picture.path[:80]!r} of the model is missing; pack it into the USDZ")
-    return decode(bytes(asset.GetBuffer()), picture.path), gray
+    return decode(bytes(asset.GetBuffer()), picture.path)

@@ -1,18 +1,22 @@
-"""OBJ and USD of other programs, and GLBs made of them."""
+"""OBJ, PLY and USD of other programs, and GLBs made of them."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from foreign_models import BOX, CORNERS, RED_AND_BLUE, png
-from pxr import Gf, Usd, UsdGeom, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.obj import read_obj
+from dg4d_lib.assets.formats.ply_mesh import read_ply_mesh
 from dg4d_lib.assets.formats.usd_model import check_usdz, read_usd
 from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.models.model import ModelPart
 
 OBJ = """mtllib a.mtl
 o thing
@@ -41,10 +45,132 @@ def test_obj_becomes_a_part_per_material() -> None:
     np.testing.assert_allclose(plain.sample(np.array([0]), np.full((1, 3), 1 / 3))[0], [[0, 1, 0]], atol=1e-5)
 
 
+def test_numbers_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(BadInput, match="not finite numbers"):
+        read_obj("v 0 0 1e300\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", FILES.get, decode_picture, 100)
+
+
 @pytest.mark.parametrize("line", ["f 1 2 9", "f 0 1 2", "f 1 2 x", "v 1 y 2", "vt 1", "f 1 2 -9"])
 def test_wrong_lines_are_named(line: str) -> None:
     with pytest.raises(BadInput, match="line 15 of the OBJ"):
         read_obj(f"{OBJ}\n{line}\nf 1 2 3", FILES.get, decode_picture, 100)
+
+
+def painted(**files: bytes) -> np.ndarray:
+    """Return the color of the first triangle of the OBJ, with other files beside it."""
+    model = read_obj(OBJ, {"a.mtl": MTL.encode(), **files}.get, decode_picture, 100)
+    return model.parts[0].sample(np.array([0]), np.full((1, 3), 1 / 3))[0]
+
+
+@pytest.mark.parametrize(
+    ("statement", "name"),
+    [
+        ("my paint.png", "my paint.png"),
+        ("-s 1 1 1 -bm 2 my paint.png", "my paint.png"),
+        (r"C:\Users\an artist\p.png", "p.png"),
+        ("/home/an artist/p.png", "p.png"),
+        (r'"sub folder\p.png"', "sub folder/p.png"),
+        ("./p.png", "p.png"),
+    ],
+)
+def test_textures_are_found_by_any_name(statement: str, name: str) -> None:
+    files = {"a.mtl": MTL.replace("p.png", statement).encode(), name: png(RED_AND_BLUE)}
+    np.testing.assert_allclose(painted(**files), [[1, 0, 0]], atol=1e-5)
+
+
+def test_a_missing_texture_is_named() -> None:
+    with pytest.raises(BadInput, match=r"texture 'p\.png' of the model is missing"):
+        read_obj(OBJ, {"a.mtl": MTL.encode()}.get, decode_picture, 100)
+
+
+def test_lines_may_go_on() -> None:
+    broken = OBJ.replace("f 1/1/1 2/1/1 ", "f 1/1/1 \\\r\n2/1/1 \\\n")
+    assert len(read_obj(broken, FILES.get, decode_picture, 100).faces) == 3
+
+
+def test_what_is_no_number_does_not_color() -> None:
+    text = "v 0 0 0 nan 0 0\nv 1 0 0 1 0 0\nv 1 1 0 1 0 0\nvt nan inf\nf 1/1 2/1 3/1\n"
+    (part,) = read_obj(text, FILES.get, decode_picture, 100).parts
+    assert part.colors is None
+    write_model_glb(read_obj(text.replace("v 0 0 0 nan 0 0", "v 0 0 0"), FILES.get, decode_picture, 100))
+
+
+def test_texture_coordinates_that_are_missing_are_left_out() -> None:
+    (part,) = read_obj("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1/1 2/2 3/7\n", FILES.get, decode_picture, 100).parts
+    assert part.uvs is None and len(part.faces) == 1
+
+
+PLY = """ply
+format ascii 1.0
+comment TextureFile  my paint.png
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 0.25 0
+1 0 0 0.25 0
+1 1 0 0.25 1
+0 1 0 0.25 1
+4 0 1 2 3
+"""
+
+
+def ply(text: str = PLY, **files: bytes) -> ModelPart:
+    (part,) = read_ply_mesh(text.encode(), files.get, decode_picture, 100).parts
+    return part
+
+
+def test_ply_with_a_texture() -> None:
+    part = ply(**{"my paint.png": png(RED_AND_BLUE)})
+    assert len(part.faces) == 2  # of the quad
+    np.testing.assert_allclose(part.sample(np.array([0, 1]), np.full((2, 3), 1 / 3))[0], [[1, 0, 0]] * 2, atol=1e-5)
+
+
+def test_ply_without_color_is_gray() -> None:
+    part = ply(PLY.replace("comment TextureFile", "comment"))
+    np.testing.assert_allclose(part.sample(np.array([0]), np.full((1, 3), 1 / 3))[0], [[0.8] * 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("of", ["vertices", "faces"])
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_ply_with_colors(of: str, encoding: str) -> None:
+    mesh = trimesh.Trimesh(CORNERS, BOX, process=False)
+    reds = np.array([255, 0, 0, 255], np.uint8), np.array([0, 0, 255, 255], np.uint8)
+    if of == "vertices":
+        mesh.visual.vertex_colors = np.where(CORNERS[:, :1] < 0, *reds)
+    else:
+        mesh.visual.face_colors = np.where((CORNERS[BOX, 0] < 0).all(1)[:, None], *reds)
+    content = mesh.export(file_type="ply", encoding=encoding)
+    (part,) = read_ply_mesh(content, FILES.get, decode_picture, 100).parts
+    corners = part.vertices[part.faces]
+    np.testing.assert_allclose(corners, CORNERS[BOX])
+    left = (corners[..., 0] < 0).all(1)
+    colors, _ = part.sample(np.arange(12), np.full((12, 3), 1 / 3))
+    np.testing.assert_allclose(colors[left], [[1, 0, 0]] * left.sum(), atol=1e-5)
+    right = (corners[..., 0] > 0).all(1)
+    np.testing.assert_allclose(colors[right], [[0, 0, 1]] * right.sum(), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (PLY, r"texture 'my paint\.png' of the model is missing"),
+        (PLY.replace("element face 1", "element face 101"), r"101 faces; asset\.max_faces allows 100"),
+        (PLY.replace("0 1 2 3", "0 1 2 9"), "cannot be read"),
+        (PLY.replace("1 1 0 0.25", "1 nan 0 0.25").replace("comment TextureFile", "comment"), "not finite"),
+        (PLY[:-20], "cannot be read"),
+        (PLY.replace("property float y", "property taste y"), "cannot be read"),
+    ],
+    ids=["no texture", "too many", "far index", "nan", "cut", "unknown type"],
+)
+def test_broken_ply_gets_a_sentence(text: str, sentence: str) -> None:
+    with pytest.raises(BadInput, match=sentence):
+        ply(text)
 
 
 def test_a_glb_of_a_model_is_that_model() -> None:
@@ -82,6 +208,105 @@ def test_usd_is_turned_upright(up: str, center: tuple[float, ...], tmp_path: Pat
     np.testing.assert_allclose(model.vertices.mean(0), center, atol=1e-6)
     assert len(model.faces) == 12 and model.parts[0].name == "box"
     np.testing.assert_allclose(model.sample(np.array([0]), np.full((1, 3), 1 / 3))[0], [[0, 0, 1]], atol=1e-5)
+
+
+def packed(folder: Path, stage: Usd.Stage) -> Path:
+    stage.Save()
+    path = folder / "b.usdz"
+    UsdUtils.CreateNewUsdzPackage(stage.GetRootLayer().realPath, str(path))
+    return path
+
+
+def box_of(stage: Usd.Stage, path: str) -> UsdGeom.Mesh:
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr([Gf.Vec3f(*map(float, corner)) for corner in CORNERS])
+    mesh.CreateFaceVertexCountsAttr([3] * 12)
+    mesh.CreateFaceVertexIndicesAttr(BOX.ravel().tolist())
+    return mesh
+
+
+def material_of(stage: Usd.Stage, path: str, color: tuple[float, float, float]) -> UsdShade.Material:
+    material = UsdShade.Material.Define(stage, path)
+    shader = UsdShade.Shader.Define(stage, f"{path}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*color))
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return material
+
+
+def test_usd_meshes_of_several_materials_have_a_part_for_each(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh = box_of(stage, "/box")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material_of(stage, "/red", (1, 0, 0)))
+    subset = UsdShade.MaterialBindingAPI(mesh).CreateMaterialBindSubset("lid", [0, 1, 99])
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material_of(stage, "/blue", (0, 0, 1)))
+    lid, rest = read_usd(packed(tmp_path, stage), decode_picture, 100).parts
+    assert (lid.name, len(lid.faces), lid.factor) == ("box lid", 2, (0, 0, 1))
+    assert (rest.name, len(rest.faces), rest.factor) == ("box", 10, (1, 0, 0))
+    np.testing.assert_array_equal(lid.vertices[lid.faces], CORNERS[BOX[:2]])
+
+
+def test_usd_instances_are_read_at_every_place(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    box_of(stage, "/original/box")
+    stage.GetPrimAtPath("/original").SetSpecifier(Sdf.SpecifierClass)
+    for number in range(2):
+        place = UsdGeom.Xform.Define(stage, f"/place_{number}")
+        place.AddTranslateOp().Set(Gf.Vec3d(3 * number, 0, 0))
+        place.GetPrim().GetReferences().AddInternalReference("/original")
+        place.GetPrim().SetInstanceable(True)
+    first, second = read_usd(packed(tmp_path, stage), decode_picture, 100).parts
+    np.testing.assert_allclose(second.vertices, first.vertices + np.float32([3, 0, 0]))
+
+
+def test_usd_skeletons_pose_their_meshes(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    stage.SetStartTimeCode(5)
+    root = UsdSkel.Root.Define(stage, "/root")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/root/bones")
+    skeleton.CreateJointsAttr(["bone"])
+    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1)])
+    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1)])
+    motion = UsdSkel.Animation.Define(stage, "/root/motion")
+    motion.CreateJointsAttr(["bone"])
+    motion.CreateTranslationsAttr().Set([Gf.Vec3f(0, 7, 0)], 5)
+    motion.CreateRotationsAttr().Set([Gf.Quatf(1)], 5)
+    motion.CreateScalesAttr().Set([Gf.Vec3h(1, 1, 1)], 5)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([motion.GetPath()])
+    binding = UsdSkel.BindingAPI.Apply(box_of(stage, "/root/box").GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateJointIndicesPrimvar(False, 1).Set([0] * 8)
+    binding.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 8)
+    stage.SetDefaultPrim(root.GetPrim())
+    model = read_usd(packed(tmp_path, stage), decode_picture, 100)
+    np.testing.assert_allclose(model.vertices.mean(0), (0, 7, 0), atol=1e-5)
+
+
+def test_usd_that_refers_to_other_files_is_refused(tmp_path: Path) -> None:
+    other = Usd.Stage.CreateNew(str(tmp_path / "other.usda"))
+    box_of(other, "/box")
+    other.SetDefaultPrim(other.GetPrimAtPath("/box"))
+    other.Save()
+    with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
+        archive.writestr("a.usda", f'#usda 1.0\ndef "box" (references = @{tmp_path}/other.usda@) {{}}\n')
+    with pytest.raises(BadInput, match="outside of its package"):
+        read_usd(tmp_path / "a.usdz", decode_picture, 100)
+
+
+def test_usd_textures_outside_of_the_package_are_not_read(tmp_path: Path) -> None:
+    (tmp_path / "p.png").write_bytes(png(RED_AND_BLUE))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh, material = box_of(stage, "/box"), material_of(stage, "/paint", (1, 0, 0))
+    texture = UsdShade.Shader.Define(stage, "/paint/texture")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(str(tmp_path / "p.png")))
+    color = UsdShade.Shader(stage.GetPrimAtPath("/paint/surface")).GetInput("diffuseColor")
+    color.ConnectToSource(texture.ConnectableAPI(), "rgb")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    stage.Save()
+    with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
+        archive.write(tmp_path / "a.usda", "a.usda")
+    with pytest.raises(BadInput, match=r"p\.png' of the model is missing"):
+        read_usd(tmp_path / "a.usdz", decode_picture, 100)
 
 
 def test_usd_with_too_many_triangles_is_refused(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 import gzip
 import struct
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import zstandard
 
 from dg4d_lib.assets.formats.foreign_splats import read_foreign_ply, read_spz
 from dg4d_lib.assets.formats.spz import write_spz
@@ -14,6 +16,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.spherical_harmonics import sh_to_rgb
 
 
 @pytest.fixture
@@ -32,6 +35,107 @@ def test_spz_comes_back_as_exact_as_it_is_stored(cloud: Gaussians, tmp_path: Pat
     torch.testing.assert_close(read.harmonics, cloud.harmonics, atol=1 / 76, rtol=0)
     torch.testing.assert_close(quat_to_rotmat(read.quats), quat_to_rotmat(cloud.quats), atol=0.01, rtol=0)
     assert notes == ()
+
+
+def test_both_versions_of_spz_hold_the_same(cloud: Gaussians, tmp_path: Path) -> None:
+    write_spz(tmp_path / "3.spz", cloud)
+    write_spz(tmp_path / "4.spz", cloud, 4)
+    three, four = (read_spz((tmp_path / f"{version}.spz").read_bytes(), 100)[0] for version in (3, 4))
+    assert all(torch.equal(getattr(three, field.name), getattr(four, field.name)) for field in fields(three))
+
+
+def spz4(**changes: int) -> bytes:
+    """Return an SPZ of version 4 with 4 splats of zeros; changed in what its header and table say."""
+    said = {"count": 4, "degree": 0, "streams": 5, "table": 32, "first": 36} | changes
+    frames = [zstandard.ZstdCompressor().compress(bytes(4 * size)) for size in (9, 1, 3, 3, 4)]
+    sizes = [(len(frame), 4 * size) for frame, size in zip(frames, (9, 1, 3, 3, 4), strict=True)]
+    sizes[0] = (sizes[0][0], said["first"])
+    header = struct.pack("<4sIIBBBB", b"NGSP", 4, said["count"], said["degree"], 12, 0, said["streams"])
+    table = b"".join(struct.pack("<QQ", *row) for row in sizes)
+    return header + struct.pack("<I12x", said["table"]) + table + b"".join(frames)
+
+
+def test_version_4_of_splats_of_zeros_is_read() -> None:
+    read, notes = read_spz(spz4(degree=3), 100)
+    assert not read.means.any() and "base color" in notes[0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [spz4(streams=4), spz4(table=0), spz4(first=37), spz4(count=5), spz4()[:-40], spz4()[:70] + spz4()[71:]],
+    ids=["too few streams", "a table in the header", "a wrong size", "too many splats", "cut", "a byte missing"],
+)
+def test_broken_spz_of_version_4_gets_a_sentence(content: bytes) -> None:
+    with pytest.raises(BadInput, match="SPZ"):
+        read_spz(content, 100)
+
+
+CHUNK = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z", *(
+    f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"))  # fmt: skip
+COLORS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
+WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def compressed_ply(bounds: list[list[float]], words: list[tuple[int, ...]], names: tuple[str, ...] = CHUNK) -> bytes:
+    """Return splats as SuperSplat compresses them."""
+    header = "ply\nformat binary_little_endian 1.0\ncomment by a test\n"
+    header += f"element chunk {len(bounds)}\n" + "".join(f"property float {name}\n" for name in names)
+    header += f"element vertex {len(words)}\n" + "".join(f"property uint {name}\n" for name in WORDS)
+    rows = np.array(bounds, "<f4").tobytes() + np.array(words, "<u4").tobytes()
+    return f"{header}end_header\n".encode() + rows
+
+
+def packed(x: int, y: int, z: int) -> int:
+    return x << 21 | y << 11 | z
+
+
+ZERO, W_LARGEST = 512, 0  # about 0 as a component of a rotation; index of the largest one
+UPRIGHT = W_LARGEST << 30 | ZERO << 20 | ZERO << 10 | ZERO
+HALF_TURN = 1 << 30 | ZERO << 20 | ZERO << 10 | ZERO  # about x
+
+
+def test_compressed_splats_lie_between_the_bounds_of_their_chunk() -> None:
+    bounds = [[0.0, 0, 0, 1, 2, 4, -5, -5, -5, -3, -3, -3], [10.0, 0, 0, 11, 2, 4, -5, -5, -5, -3, -3, -3]]
+    first = (packed(0, 1023, 2047), UPRIGHT, packed(2047, 0, 2047), 0xFF800040)
+    last = (packed(2047, 0, 0), HALF_TURN, packed(0, 0, 0), 0x000000FF)
+    read, notes = read_foreign_ply(compressed_ply(bounds, [first] * 256 + [last]), 300)
+    torch.testing.assert_close(read.means[[0, 256]], torch.tensor([[0.0, 2, 4], [11, 0, 0]]))
+    torch.testing.assert_close(read.log_scales[[0, 256]], torch.tensor([[-3.0, -5, -3], [-5, -5, -5]]))
+    turned = quat_to_rotmat(read.quats[[0, 256]])
+    expected = torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1, -1]))])
+    torch.testing.assert_close(turned, expected, atol=0.01, rtol=0)
+    torch.testing.assert_close(sh_to_rgb(read.harmonics[[0]]), torch.tensor([[1, 128 / 255, 0]]))
+    torch.testing.assert_close(read.opacities[[0, 256]], torch.tensor([64 / 255, 0.9999]), atol=1e-4, rtol=0)
+    assert notes == ()
+
+
+def test_compressed_colors_have_bounds_in_newer_files() -> None:
+    bounds = [[0.0, 0, 0, 1, 1, 1, -5, -5, -5, -3, -3, -3, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0]]
+    content = compressed_ply(bounds, [(0, UPRIGHT, 0, 0xFFFFFFFF)] * 4, (*CHUNK, *COLORS))
+    torch.testing.assert_close(sh_to_rgb(read_foreign_ply(content, 4)[0].harmonics[:1]), torch.tensor([[0.5, 0.5, 1]]))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (compressed_ply([[0.0] * 12], [(0, 0, 0, 0)] * 257), "1 chunks of 256 for 257 splats"),
+        (compressed_ply([[0.0] * 12], [(0, 0, 0, 0)] * 9)[:-1], "truncated"),
+        (compressed_ply([[0.0] * 11], [(0, 0, 0, 0)] * 9, CHUNK[:-1]), "lack bounds"),
+        (compressed_ply([[0.0] * 12], [(0, 0, 0, 0)] * 9).replace(b"packed_color", b"packed_taste"), "packed_color"),
+        (compressed_ply([[np.nan] * 12], [(0, 0, 0, 0)] * 9), "not finite"),
+        (compressed_ply([[0.0] * 12], [(0, 0, 0, 0)] * 9999), r"9999 splats; asset\.max_splats"),
+    ],
+    ids=["too few chunks", "cut", "no bounds", "no color", "nan", "too many"],
+)
+def test_broken_compressed_splats_get_a_sentence(content: bytes, sentence: str) -> None:
+    with pytest.raises(BadInput, match=sentence):
+        read_foreign_ply(content, 300)
+
+
+def test_points_alone_are_refused(tmp_path: Path) -> None:
+    content = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    with pytest.raises(BadInput, match="points alone cannot be animated"):
+        read_foreign_ply(content, 100)
 
 
 def test_rotations_of_version_2_are_read() -> None:

@@ -44,6 +44,31 @@ def test_an_obj_comes_with_materials_and_textures(tmp_path: Path, store: Artifac
     assert entries(tmp_path / "x.OBJ", store) == ["model.obj", "my materials.mtl", "paint.png"]
 
 
+@pytest.mark.parametrize("statement", ["my paint.png", r"C:\textures\my paint.png", "-clamp on my paint.png"])
+def test_textures_with_spaces_in_their_names_come_along(statement: str, tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.obj").write_text("mtllib a.mtl\nv 0 0 0\n")
+    (tmp_path / "a.mtl").write_text(f"newmtl a\nmap_Kd {statement}\n")
+    (tmp_path / "my paint.png").write_bytes(b"1")
+    assert entries(tmp_path / "x.obj", store) == ["model.obj", "a.mtl", "my paint.png"]
+
+
+def test_a_ply_comes_with_its_texture(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile my paint.png\nend_header\n")
+    (tmp_path / "my paint.png").write_bytes(b"1")
+    assert entries(tmp_path / "x.ply", store) == ["model.ply", "my paint.png"]
+
+
+def test_spz_of_both_kinds_is_admitted(tmp_path: Path, store: ArtifactStore) -> None:
+    for name, content in {"3.spz": b"\x1f\x8b", "4.spz": b"NGSP"}.items():
+        (tmp_path / name).write_bytes(content)
+        assert entries(tmp_path / name, store) == ["model.spz"]
+
+
+def test_names_that_are_too_long_are_left_to_the_reader(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.gltf").write_text(json.dumps({"buffers": [{"uri": "a" * 5000}]}))
+    assert entries(tmp_path / "x.gltf", store) == ["model.gltf"]
+
+
 def test_the_name_of_a_model_does_not_count(tmp_path: Path, store: ArtifactStore) -> None:
     for name in ("a.glb", "b.glb"):
         (tmp_path / name).write_bytes(b"glTF same")
@@ -66,6 +91,7 @@ REFUSED = {
     "c.glb": (b"PK??", r"does not start as a \.glb"),
     "d.gltf": (b"{", "no glTF"),
     "e.gltf": (b"[" * 2000, "no glTF"),
+    "f.spz": (b"nothing", r"does not start as a \.spz"),
 }
 
 
