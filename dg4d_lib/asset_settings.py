@@ -182,6 +182,11 @@ class AssetSettings(Settings):
     )
     points: int = Field(12000, ge=100, le=200000, description="number of Gaussians on the surface of a mesh")
     fit_points: int = Field(6000, ge=100, le=200000, description="number of Gaussians that the fit renders")
+    skeleton: bool = Field(
+        True,
+        description="where the first frame shows a skinned model in another pose than at rest, its joints are turned "
+        "to that pose and move it; false: its surface bends",
+    )
     nodes: int = Field(200, ge=4, le=2000, description="number of control nodes on the surface")
     size: int = Field(128, ge=32, le=512, multiple_of=16, description="pixels of the compared pictures")
     tracking: Literal["flow", "descent"] = Field(

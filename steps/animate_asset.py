@@ -9,17 +9,20 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_joints import read_skeleton
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.fitting.rigid_parts import keep_pieces_whole
+from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion, skeleton_iterations
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.models.atlas import merge_parts
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_of_points, point_graph
 from dg4d_lib.mesh.models.flips import unflip
+from dg4d_lib.mesh.models.skeleton import JointGraph, joint_graph
 from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
 from dg4d_lib.mesh.neighbors import connected_parts, edge_graph
 from dg4d_lib.mesh.textured import TrackedMesh
@@ -35,6 +38,7 @@ from steps.runtime.job import Job, StepReport
 PICTURE_FRAMES = 6
 NOTE = "The motion of sides that the video does not show follows from the rigidity of the surface."
 RIGID_NOTE = "Rigid parts that the model moves as: {}. They show the video better than a surface that bends."
+JOINT_NOTE = "The skeleton of the model moves it; how limbs turn where the video does not show it is a guess."
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ class _Mesh:
     placement: Placement
     surface: SurfaceCloud
     graph: ControlGraph
+    joints: JointGraph | None
 
 
 def run(job: Job) -> StepReport:
@@ -60,27 +65,41 @@ def run(job: Job) -> StepReport:
         # covered in its own coordinates, as in prepare_asset: rows of `nearest` are rows of the Gaussians
         covered = cover_surface(glb.model, settings.points, torch.Generator().manual_seed(job.seed))
         surface = covered.placed(placement.quat, placement.scale, placement.shift)
-        control = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
-        mesh = _Mesh(glb, placement, surface, control)
+        mesh = _controlled(glb, placement, surface, settings)
         graph = mesh.graph.of(surface.nearest)
     else:
         points = cloud.means.double().numpy()
         graph = graph_of_points(points, point_graph(points), settings.nodes)
-    curves = LossCurves(iterations(settings, len(video)), job.progress)
+    joints = mesh.joints if mesh else None
+    count = (iterations if joints is None else skeleton_iterations)(settings, len(video))
+    curves, generator = LossCurves(count, job.progress), torch.Generator().manual_seed(job.seed)
     with picture_of_divergence(job, rasterize):
-        generator = torch.Generator().manual_seed(job.seed)
-        motion = fit_asset_motion(cloud, graph, video, rasterize, settings, generator, curves.add)
-    if mesh:
+        if mesh and joints is not None:
+            gaussians = joints.of(mesh.surface.nearest)
+            motion = fit_skeleton_motion(cloud, gaussians, video, rasterize, settings, generator, curves.add)
+        else:
+            motion = fit_asset_motion(cloud, graph, video, rasterize, settings, generator, curves.add)
+    if mesh and joints is None:
         mesh = replace(mesh, graph=moving_graph(mesh.graph, motion, settings.rigid_parts, mesh.surface.fine.faces))
         graph = mesh.graph.of(mesh.surface.nearest)
     states = moved_states(cloud, graph, motion)
     deformation = framewise(cloud, states)
     write_motion(job.outputs["motion"], deformation, FramewiseSettings(), len(video), len(cloud))
-    note = motion_note(motion, settings.rigid_parts)
+    note = motion_note(motion, settings.rigid_parts) if joints is None else JOINT_NOTE
     notes = [note, *(_write_mesh(job, mesh, motion, video.fps, note) if mesh else ())]
     curves.write(job.outputs["curves"], "motion of the model", notes)
     write_png(job.outputs["picture"], _picture(states, rasterize))
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
+
+
+def _controlled(glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, settings: AssetSettings) -> _Mesh:
+    """Return a mesh that its joints move where it was posed by them, and control nodes on its surface elsewhere."""
+    skeleton = read_skeleton(glb) if placement.posed else None
+    if skeleton is None:
+        control = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
+        return _Mesh(glb, placement, surface, control, None)
+    joints = joint_graph(skeleton, surface, glb.model.faces, placement.matrix)
+    return _Mesh(glb, placement, surface, joints.graph, joints)
 
 
 def motion_note(motion: NodeMotion, most_parts: int) -> str:

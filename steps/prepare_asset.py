@@ -1,5 +1,6 @@
 """Step that reads a model of the user's own and finds its place in the frame of the subject."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -8,18 +9,31 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb
+from dg4d_lib.assets.formats.foreign_joints import read_skeleton
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.asset_pose import Placement, centered_placement, find_placement, picture_of_both
+from dg4d_lib.fitting.asset_pose import (
+    Placement,
+    centered_placement,
+    distinct_placements,
+    find_placement,
+    picture_of_both,
+)
+from dg4d_lib.fitting.skeleton_motion import PosedModel, pose_model
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
-from dg4d_lib.mesh.models.surface_cloud import cover_surface
+from dg4d_lib.mesh.models.skeleton import joint_graph
+from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import read_png, write_png
 from steps.artifacts.placements import write_placement
 from steps.fitting.reporting import render_turnaround
 from steps.runtime.job import Job, StepReport
 from steps.sources.models import OwnModel, read_model
+
+POSED = 0.9  # IoU of the outlines of model and first frame below which the model is posed, not only placed
+POSE_NOTE = "The model rests in another pose than the first frame; its skeleton was posed to compare both."
 
 
 def run(job: Job) -> StepReport:
@@ -33,16 +47,26 @@ def run(job: Job) -> StepReport:
     with TemporaryDirectory() as scratch:
         own = read_model(job.inputs["model"], Path(scratch), settings, job.settings.max_decode_gb)
     job.progress(1, 3, {})
-    cloud = _cloud(own, settings, job.seed)
+    surface = None if own.glb is None else cover(own.glb, settings, job.seed)
+    cloud = own.splats if surface is None else surface.cloud
+    assert cloud is not None  # a model is a mesh or splats
     azimuth = None if settings.find_azimuth else settings.azimuth_deg
+    posed = None
     if "subject" in job.inputs:
         subject = read_png(job.inputs["subject"])
         placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
+        if own.glb is not None and surface is not None and placement.agreement < POSED:
+            posed = _posed(own.glb, surface, subject, rasterize, settings, own.ups)
     else:
         placement = centered_placement(cloud, settings.azimuth_deg, own.ups[0])
         subject = render_subject(placement.apply(cloud), job.settings.size, rasterize)
         write_png(job.outputs["subject"], subject)
     both = picture_of_both(cloud, placement, subject, rasterize)
+    if posed is not None and posed.placement.agreement > placement.agreement:
+        placement = posed.placement
+        both = picture_of_both(
+            posed.cloud, Placement(torch.tensor((1.0, 0, 0, 0)), 1.0, torch.zeros(3)), subject, rasterize
+        )
     if "subject" in job.inputs and placement.agreement < settings.min_agreement:
         write_png(job.pictures / "model_and_subject.png", both)
         raise BadInput(_disagreement(placement, settings))
@@ -54,7 +78,8 @@ def run(job: Job) -> StepReport:
     write_placement(job.outputs["placement"], placement)
     write_png(job.outputs["picture"], _stacked(both, render_turnaround(placed, rasterize)))
     job.progress(3, 3, {})
-    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=(*_notes(own, placement, job), *own.notes))
+    notes = (*_notes(own, placement, job), *([POSE_NOTE] if placement.posed else []), *own.notes)
+    return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=notes)
 
 
 def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[Tensor, "s s 4"]:
@@ -65,12 +90,29 @@ def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[
     return torch.cat([straight, drawn.alpha[0]], -1).clamp(0, 1)
 
 
-def _cloud(own: OwnModel, settings: AssetSettings, seed: int) -> Gaussians:
-    """Return the model as Gaussians, in its own coordinates."""
-    if own.splats is not None:
-        return own.splats
-    assert own.glb is not None  # a model is a mesh or splats
-    return cover_surface(own.glb.model, settings.points, torch.Generator().manual_seed(seed)).cloud
+def cover(glb: ForeignGlb, settings: AssetSettings, seed: int) -> SurfaceCloud:
+    """Return the surface of a model as Gaussians, in its own coordinates."""
+    return cover_surface(glb.model, settings.points, torch.Generator().manual_seed(seed))
+
+
+def _posed(
+    own: ForeignGlb,
+    surface: SurfaceCloud,
+    subject: Float[Tensor, "s s 4"],
+    rasterize: Rasterizer,
+    settings: AssetSettings,
+    ups: Sequence[str],
+) -> PosedModel | None:
+    """Return the model in the pose of the first frame, from the side that shows it best; None without a skeleton."""
+    skeleton = read_skeleton(own) if settings.skeleton else None
+    if skeleton is None:
+        return None
+    azimuth = None if settings.find_azimuth else settings.azimuth_deg
+    found = []
+    for placement in distinct_placements(surface.cloud, subject, rasterize, azimuth, ups):
+        joints = joint_graph(skeleton, surface, own.model.faces, placement.matrix).of(surface.nearest)
+        found.append(pose_model(placement.apply(surface.cloud), joints, subject, placement, rasterize, settings))
+    return min(found, key=lambda one: one.difference)
 
 
 def _disagreement(placement: Placement, settings: AssetSettings) -> str:

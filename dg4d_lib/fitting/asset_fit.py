@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 
@@ -113,7 +113,7 @@ class AssetFit:
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:
         """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
-        losses = self._picture_losses(motion, list(range(len(motion.shifts))))
+        losses = self.picture_losses(motion, list(range(len(motion.shifts))))
         return float(losses["color"] + losses["alpha"])
 
     def residuals(self, motion: NodeMotion, frames: list[int]) -> Float[Tensor, "t r"]:
@@ -131,25 +131,34 @@ class AssetFit:
 
     def losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of some frames."""
+        return {
+            **self.picture_losses(motion, frames),
+            "rigidity": self.settings.rigidity * self.rigidity(motion),
+            "unseen": self.unseen(motion),
+        }
+
+    def unseen(self, motion: NodeMotion) -> Float[Tensor, ""]:
+        """Return the weighted loss of displacements in depth and across the mirror plane."""
         settings = self.settings
         shifts = self.relative(motion.nodes(self.graph) - self.graph.nodes)
         depth = shifts[..., 2]
         unseen = settings.depth * depth.square().mean() + settings.whole_depth * depth.mean(-1).square().mean()
-        if self.normal is not None:
-            across = (shifts @ torch.from_numpy(self.normal).to(shifts)).square().mean()
-            unseen = unseen + across_weight(settings, self.normal) * across
-        return {
-            **self._picture_losses(motion, frames),
-            "rigidity": settings.rigidity * self.rigidity(motion),
-            "unseen": unseen,
-        }
+        if self.normal is None:
+            return unseen
+        across = (shifts @ torch.from_numpy(self.normal).to(shifts)).square().mean()
+        return unseen + across_weight(settings, self.normal) * across
 
-    def _picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
+    def picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of color and alpha of some frames."""
         rendering = self._rendering(motion)
         color = pyramid_error(rendering.color, self.colors[frames]) / self.area
         alpha = pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
         return {"color": self.settings.color_weight * color, "alpha": self.settings.alpha_weight * alpha}
+
+    @torch.no_grad()
+    def silhouettes(self, motion: NodeMotion) -> Bool[Tensor, "t h w 1"]:
+        """Return where the model is in the pictures."""
+        return self._rendering(motion).alpha > 0.5
 
     def _rendering(self, motion: NodeMotion) -> Rendering:
         """Render the Gaussians at every moment of a motion."""

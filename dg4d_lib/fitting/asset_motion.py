@@ -63,7 +63,7 @@ def fit_asset_motion(
     """
     surface = cloud.means.double().numpy(force=True) if surface is None else surface
     normal = mirror_normal(surface) if settings.across else None
-    thin, bound = _thinned(cloud, graph, settings.fit_points)
+    thin, bound = thinned_graph(cloud, graph, settings.fit_points)
     found: list[tuple[float, NodeMotion, AssetFit]] = []
     done = 0
     for rigidity_loss in _rigidity_losses(settings):
@@ -178,7 +178,7 @@ def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, repo
     return tracked[1:]
 
 
-def _thinned(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
+def thinned_graph(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
     """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
     step = max(1, round(len(cloud) / count))
     return thinned(cloud, step), graph.of(torch.arange(0, len(cloud), step))

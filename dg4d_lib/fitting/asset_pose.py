@@ -29,6 +29,7 @@ FINE_SIZE = 96  # pixels of the refinement
 SEARCHED = 2500  # Gaussians in the search
 STEPS = 24  # azimuths of the search
 KEPT = 3  # candidates that are refined
+APART = 60  # degrees between the azimuths of placements that count as different
 ITERATIONS = 40
 REACH = 0.6  # world units: half diagonal of a model without a picture
 BATCH = 8  # renders at once
@@ -47,6 +48,7 @@ class Placement:
         azimuth_deg: azimuth of the model from which the picture was taken.
         agreement: IoU of the outlines of model and subject.
         color_error: root mean square difference of the colors where both are.
+        posed: the picture shows another pose than the model has at rest, and `agreement` is that of the posed model.
     """
 
     quat: Float[Tensor, " 4"]
@@ -55,6 +57,7 @@ class Placement:
     azimuth_deg: float = 0.0
     agreement: float = 1.0
     color_error: float = 0.0
+    posed: bool = False
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
@@ -108,14 +111,8 @@ def find_placement(
         azimuth_deg: azimuth of the model, if the user says it.
         ups: axes that may point up.
     """
-    sparse = thinned(cloud, max(1, len(cloud) // SEARCHED))
-    azimuths = [azimuth_deg] if azimuth_deg is not None else [360 * step / STEPS for step in range(STEPS)]
-    candidates = [centered_placement(sparse, azimuth, up) for up in ups for azimuth in azimuths]
-    for _ in range(2):
-        candidates = _framed(sparse, candidates, subject, rasterize)
-    judged = judge(sparse, candidates, subject, rasterize, SIZE)
-    best = sorted(judged, key=lambda one: -one.score)[:KEPT]
-    refined = [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in best]
+    sparse, best = _searched(cloud, subject, rasterize, azimuth_deg, ups)
+    refined = [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in best[:KEPT]]
     as_it_stands = Placement(torch.tensor(UPRIGHT["y"]), 1.0, torch.zeros(3))
     tried = [*refined, *([as_it_stands] if not azimuth_deg else [])]
     results = judge(cloud, tried, subject, rasterize, FINE_SIZE)
@@ -123,6 +120,47 @@ def find_placement(
     if not azimuth_deg and results[-1].score + STANDS >= found.score:
         return results[-1]
     return found
+
+
+def distinct_placements(
+    cloud: Gaussians,
+    subject: Float[Tensor, "h w 4"],
+    rasterize: Rasterizer,
+    azimuth_deg: float | None = None,
+    ups: Sequence[str] = ("y",),
+) -> list[Placement]:
+    """Return the best placements of different azimuths, for a model whose pose in the picture is not known.
+
+    Outlines tell the front from the back only of a model that stands as the picture shows it. The arguments are those
+    of `find_placement`.
+    """
+    sparse, ranked = _searched(cloud, subject, rasterize, azimuth_deg, ups)
+    chosen: list[Placement] = []
+    for one in ranked:
+        if all(_degrees_between(one.azimuth_deg, other.azimuth_deg) >= APART for other in chosen):
+            chosen.append(one)
+    return [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in chosen[:KEPT]]
+
+
+def _searched(
+    cloud: Gaussians,
+    subject: Float[Tensor, "h w 4"],
+    rasterize: Rasterizer,
+    azimuth_deg: float | None,
+    ups: Sequence[str],
+) -> tuple[Gaussians, list[Placement]]:
+    """Return some of the Gaussians, and placements all around, the best first."""
+    sparse = thinned(cloud, max(1, len(cloud) // SEARCHED))
+    azimuths = [azimuth_deg] if azimuth_deg is not None else [360 * step / STEPS for step in range(STEPS)]
+    candidates = [centered_placement(sparse, azimuth, up) for up in ups for azimuth in azimuths]
+    for _ in range(2):
+        candidates = _framed(sparse, candidates, subject, rasterize)
+    judged = judge(sparse, candidates, subject, rasterize, SIZE)
+    return sparse, sorted(judged, key=lambda one: -one.score)
+
+
+def _degrees_between(first: float, second: float) -> float:
+    return abs((first - second + 180) % 360 - 180)
 
 
 def judge(

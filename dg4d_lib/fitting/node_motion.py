@@ -158,16 +158,17 @@ class NodeVariables:
         return NodeMotion(quats, shifts, _quats(self.whole_turns), self.whole_shifts)
 
 
-class NodeDescent:
-    """Adam with one step size for all coordinates of a variable and frame, so that weak gradients stay weak.
+class Descent:
+    """Adam with about one step size for all coordinates of a variable and frame, so that weak gradients stay weak.
 
     As steps do not shrink with gradients, they would move a first frame that is solved: `held` says how many first
-    frames stay as they are.
+    frames stay as they are. An `evenness` below 1 mixes in steps of their own for the coordinates.
     """
 
-    def __init__(self, variables: NodeVariables, basis: NodeBasis, held: int = 0) -> None:
-        self.values, self.held = vars(variables), held
-        self.factors = INTEGRATED_FACTORS if basis.integrated else FACTORS
+    def __init__(
+        self, values: dict[str, Tensor], factors: dict[str, float], held: int = 0, evenness: float = 1.0
+    ) -> None:
+        self.values, self.factors, self.held, self.evenness = values, factors, held, evenness
         self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
         self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
         self.count = 0
@@ -182,10 +183,19 @@ class NodeDescent:
             first, second = self.first[name], self.second[name]
             first.lerp_(value.grad, 1 - BETA1)
             second.lerp_(value.grad.square(), 1 - BETA2)
-            largest = second.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1)) / (1 - BETA2**self.count)
+            square = second / (1 - BETA2**self.count)
+            largest = square.flatten(1).amax(1).view(-1, *[1] * (second.dim() - 1))
+            size = self.evenness * largest.sqrt() + (1 - self.evenness) * square.sqrt()
             moment = first / (1 - BETA1**self.count)
-            change = lr * self.factors[name] * moment / (largest.sqrt() + 1e-12)
+            change = lr * self.factors[name] * moment / (size + 1e-12)
             value[self.held :].sub_(change[self.held :])
+
+
+class NodeDescent(Descent):
+    """Descent over the variables of nodes."""
+
+    def __init__(self, variables: NodeVariables, basis: NodeBasis, held: int = 0) -> None:
+        super().__init__(vars(variables), INTEGRATED_FACTORS if basis.integrated else FACTORS, held)
 
 
 def _quats(turns: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:

@@ -19,6 +19,7 @@ class StoredPlacement(Frozen):
     azimuth_deg: float
     agreement: float
     color_error: float
+    posed: bool
 
 
 def write_placement(path: Path, placement: Placement) -> None:

@@ -3,6 +3,7 @@
 import json
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 import trimesh
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -22,6 +24,7 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps import animate_asset, pack_asset, prepare_asset
 from steps.artifacts.media import read_png, write_frames, write_png
+from steps.artifacts.meshes import read_tracked
 from steps.artifacts.motions import read_motion
 from steps.artifacts.packages import read_manifest
 from steps.artifacts.placements import read_placement
@@ -182,6 +185,74 @@ def test_the_package_has_the_users_own_mesh(animated: tuple[Job, dict[str, Path]
     assert len(own.model.vertices) == len(fish().vertices)
     surface = read_surface(tmp_path / "package", manifest)
     assert len(surface.offsets) == 3 and len(surface.mesh.faces) == len(fish().faces)
+
+
+ALONG, UPPER = 13, 0.4  # vertices along the arm, and half of its length
+
+
+def arm_glb() -> bytes:
+    """Return a skinned arm along x, red, then blue, with joints at its left end and in its middle."""
+    x = np.linspace(-UPPER, UPPER, ALONG)
+    around = [(-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1)]
+    vertices = np.concatenate([np.stack([x, np.full(ALONG, y), np.full(ALONG, z)], 1) for y, z in around])
+    sides = [(ALONG * side, ALONG * ((side + 1) % 4)) for side in range(4)]
+    quads = [(a + k, b + k, b + k + 1, a + k + 1) for a, b in sides for k in range(ALONG - 1)]
+    faces = np.array([corners for a, b, c, d in quads for corners in ((a, b, c), (a, c, d))])
+    colors = np.where(vertices[:, :1] < 0, [[0.8, 0.1, 0.1]], [[0.1, 0.1, 0.8]])
+    document, above = GltfDocument({}), vertices[:, :1] > 0
+    binding = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+    binding[0, 3, 0] = UPPER  # column by column: the first joint is bound at the left end
+    rows = {
+        "POSITION": vertices.astype("<f4"),
+        "COLOR_0": colors.astype("<f4"),
+        "JOINTS_0": np.tile(np.array([0, 1, 0, 0], np.uint8), (len(vertices), 1)),
+        "WEIGHTS_0": np.concatenate([~above, above, 0 * above, 0 * above], 1).astype("<f4"),
+    }
+    attributes = {name: document.add_accessor(name, values, VERTEX_DATA) for name, values in rows.items()}
+    indices = document.add_accessor("triangles", faces.ravel().astype("<u2"), INDEX_DATA)
+    mesh = document.add("meshes", name="arm", primitives=[{"attributes": attributes, "indices": indices}])
+    document.add("nodes", name="shoulder", translation=[-UPPER, 0.0, 0.0], children=[1])
+    document.add("nodes", name="elbow", translation=[UPPER, 0.0, 0.0])
+    view = document.add_view("binding", binding.tobytes())
+    matrices = document.add("accessors", bufferView=view, componentType=5126, count=2, type="MAT4")
+    skin = document.add("skins", joints=[0, 1], inverseBindMatrices=matrices)
+    node = document.add("nodes", name="arm", mesh=mesh, skin=skin)
+    document.tree["scene"] = document.add("scenes", nodes=[0, node])
+    return document.to_bytes()
+
+
+def bent_arm(angle: float) -> Model:
+    """Return the arm with its forearm raised by an angle, in radians."""
+    (part,) = read_foreign_glb(arm_glb(), 1000).model.parts
+    c, s = np.cos(angle), np.sin(angle)
+    raised = part.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
+    return Model((replace(part, vertices=np.where(part.vertices[:, :1] > 0, raised, part.vertices)),))
+
+
+def test_a_skinned_model_is_posed_as_the_first_frame_shows_it_and_its_joints_move_it(tmp_path: Path) -> None:
+    angles = np.array([1.3, 1.1, 0.9])
+    frames = torch.stack([render(bent_arm(angle), 0.0) for angle in angles])
+    write_png(tmp_path / "subject.png", frames[0])
+    path = zipped(tmp_path, model_glb=arm_glb())
+    prepare = job_of("prepare_asset", tmp_path / "prepare", {"model": path, "subject": tmp_path / "subject.png"})
+    report = prepare_asset.run(prepare)
+    placement = read_placement(prepare.outputs["placement"])
+    assert placement.posed and placement.agreement > 0.8
+    assert prepare_asset.POSE_NOTE in report.notes
+    write_frames(tmp_path / "video", DrivingVideo(frames[..., :3], frames[..., 3:], 10.0))
+    inputs = {name: prepare.outputs[name] for name in ("gaussians", "glb", "placement")}
+    animate = job_of("animate_asset", tmp_path / "animate", {**inputs, "driving_video": tmp_path / "video"})
+    notes = animate_asset.run(animate).notes
+    assert animate_asset.JOINT_NOTE in notes
+    moving = read_foreign_glb(animate.outputs["moving"].read_bytes(), 1000)
+    assert "skins" in moving.reader.tree
+    tracked = read_tracked(animate.outputs["tracked"])
+    moved = tracked.mesh.vertices + tracked.offsets
+    tips = moved[:, (tracked.mesh.vertices[:, 0] == tracked.mesh.vertices[:, 0].max())].mean(1)
+    height = (tips[:, 1] - moved[:, :, 1].mean(1)) / placement.scale
+    expected = np.stack([bent_arm(angle).vertices for angle in angles])
+    right = bent_arm(0.0).vertices[:, 0] > UPPER - 1e-4
+    assert height.tolist() == pytest.approx((expected[:, right, 1].mean(1) - expected[..., 1].mean(1)), abs=0.08)
 
 
 def test_splats_stay_splats(tmp_path: Path) -> None:

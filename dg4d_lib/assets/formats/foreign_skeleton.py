@@ -3,7 +3,7 @@
 Joints keep their distances and the weights that the model gives them. What they cannot do is left to morph targets.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,17 +114,10 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
     Raises:
         SkeletonAtRest: there are no or too many joints, or they would not show more of the motion than none.
     """
-    used = {joint for one in skinned for joint in one.joints}
-    joints = tuple(node for node in rest if node in used)
+    joints, movers = joints_and_movers(rest, parents, {joint for one in skinned for joint in one.joints})
     if len(joints) > MOST_JOINTS:
         raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are moved")
     number = {joint: index for index, joint in enumerate(joints)}
-    movers: dict[int, int] = {}
-    for node in rest:
-        if node in number:
-            movers[node] = number[node]
-        elif parents.get(node) in movers:
-            movers[node] = movers[parents[node]]
     weights = [_by_joint(one, number) for one in skinned]
     if not any(one.any() for one in weights):
         raise SkeletonAtRest("it moves no vertex")
@@ -140,6 +133,27 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
     matrices = np.tile(np.eye(4), (*maps.shape[:2], 1, 1))
     matrices[:, :, :3] += maps
     return SkeletonMotion(rest, parents, movers, joints, matrices[1:].swapaxes(0, 1))
+
+
+def joints_and_movers(
+    rest: Matrices, parents: Mapping[int, int], used: Set[int]
+) -> tuple[tuple[int, ...], dict[int, int]]:
+    """Return the joints, parents before their children, and the number of the joint that a node moves with, if any.
+
+    Args:
+        rest: global matrix of every node, parents before their children.
+        parents: parent of every node that has one.
+        used: nodes that are joints of a skin.
+    """
+    joints = tuple(node for node in rest if node in used)
+    number = {joint: index for index, joint in enumerate(joints)}
+    movers: dict[int, int] = {}
+    for node in rest:
+        if node in number:
+            movers[node] = number[node]
+        elif parents.get(node) in movers:
+            movers[node] = movers[parents[node]]
+    return joints, movers
 
 
 def _fitted(

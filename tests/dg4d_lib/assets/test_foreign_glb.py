@@ -9,6 +9,7 @@ import trimesh
 from foreign_models import CORNERS, box_glb, skinned_glb
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_joints import read_skeleton
 from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
 from dg4d_lib.errors import BadInput
 
@@ -225,6 +226,36 @@ def test_materials_of_older_exporters_have_their_color():
     ours, theirs = (read_foreign_glb(content, MOST).model for content in (edited(box_glb(), older), box_glb()))
     ids, middle = np.arange(12), np.full((12, 3), 1 / 3)
     np.testing.assert_array_equal(ours.sample(ids, middle)[0], theirs.sample(ids, middle)[0])
+
+
+def test_a_skeleton_is_read_with_its_weights():
+    glb = read_foreign_glb(skinned_glb(bound=True), MOST)
+    skeleton = read_skeleton(glb)
+    np.testing.assert_allclose(skeleton.places, [(0, 0, 0), (0, 0.5, 0)])
+    np.testing.assert_array_equal(skeleton.parents, [-1, 0])
+    heights = np.tile(np.linspace(0, 1, 9), 2)
+    np.testing.assert_allclose(skeleton.weights.toarray(), np.stack([1 - heights, heights], 1), atol=1e-6)
+
+
+def test_skeletons_that_move_little_or_nothing_are_not_used():
+    assert read_skeleton(read_foreign_glb(box_glb(), MOST)) is None
+
+    def with_a_rigid_copy(tree):
+        copies = [{**tree["nodes"][2], "translation": [k, 0, 0]} for k in range(5)]
+        tree["nodes"] += [{key: value for key, value in copy.items() if key != "skin"} for copy in copies]
+        tree["scenes"][0]["nodes"] += list(range(3, 8))
+
+    assert read_skeleton(read_foreign_glb(edited(skinned_glb(), with_a_rigid_copy), MOST)) is None
+
+
+def test_meshes_that_hang_on_a_joint_have_its_whole_weight():
+    def with_a_hat(tree):
+        hat = {key: value for key, value in tree["nodes"][2].items() if key not in ("skin", "translation")}
+        tree["nodes"].append(hat)
+        tree["nodes"][1]["children"] = [3]
+
+    weights = read_skeleton(read_foreign_glb(edited(skinned_glb(), with_a_hat), MOST)).weights.toarray()
+    np.testing.assert_array_equal(weights[18:], [(0, 1)] * 18)
 
 
 BROKEN = {
