@@ -32,7 +32,8 @@ ADVICE = "set asset.skeleton to false"
 COARSE = 64  # pixels of the compared pictures in a search
 POINTS = 4000  # Gaussians of it
 RATES = (0.06, 0.02, 0.007)  # of the search: far poses need large steps, and near ones are lost by them
-SEARCHED, FINISHED, TRACKED = 100, 40, 40  # iterations: at the first frame, coarse and fine; at another frame
+SEARCHED, FINISHED = 100, 40  # iterations at the first frame, coarse and fine
+TRACKED, TRUED = 30, 12  # likewise at every other frame
 FINER, TRACKING = 0.01, 0.02  # rates of the finer steps at the first frame and at all, and while tracking
 FACTORS = {"turns": 2.0, "whole_turn": 0.5, "whole_shift": 0.2, "whole_depth": 0.4}  # of the rates
 EVENNESS = 0.5  # of the steps of all joints: 1 leaves weak gradients weak, 0 makes them as strong as others
@@ -154,13 +155,14 @@ def fit_skeleton_motion(
     poses = [search.first_pose()]
     for frame in range(1, len(video)):
         start = poses[-1] if frame == 1 else poses[-1].continued(poses[-2])
-        poses.append(search.descended(search.coarse, start, frame, TRACKED, TRACKING, steady=True)[0])
+        rough, _ = search.descended(search.coarse, start, frame, TRACKED, TRACKING, steady=True)
+        poses.append(search.descended(search.fine, rough, frame, TRUED, FINER, steady=True)[0])
     return search.together(JointVariables.joined(poses), generator)
 
 
 def skeleton_iterations(settings: AssetSettings, frames: int) -> int:
     """Return the number of iterations that a fit reports."""
-    return len(RATES) * SEARCHED + FINISHED + TRACKED * (frames - 1) + settings.joint_iterations
+    return len(RATES) * SEARCHED + FINISHED + (TRACKED + TRUED) * (frames - 1) + settings.joint_iterations
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting import skeleton_motion
 from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.gaussians.ply import read_ply, write_ply
 from dg4d_lib.mesh.models.model import Model, ModelPart
@@ -229,7 +230,11 @@ def bent_arm(angle: float) -> Model:
     return Model((replace(part, vertices=np.where(part.vertices[:, :1] > 0, raised, part.vertices)),))
 
 
-def test_a_skinned_model_is_posed_as_the_first_frame_shows_it_and_its_joints_move_it(tmp_path: Path) -> None:
+def test_a_skinned_model_is_posed_as_the_first_frame_shows_it_and_its_joints_move_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"RATES": (0.06,), "FINISHED": 20, "TRACKED": 20, "TRUED": 5}.items():
+        monkeypatch.setattr(skeleton_motion, name, value)
     angles = np.array([1.3, 1.1, 0.9])
     frames = torch.stack([render(bent_arm(angle), 0.0) for angle in angles])
     write_png(tmp_path / "subject.png", frames[0])

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting import skeleton_motion
 from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.fitting.skeleton_motion import (
     JointChains,
@@ -29,6 +30,12 @@ from dg4d_lib.video.driving import DrivingVideo
 RASTERIZE = get_rasterizer("cpu")
 SETTINGS = AssetSettings(size=48, points=1500, fit_points=1500, joint_iterations=10, joint_frames=4, across=0)
 COUNT = 13  # vertices along the arm
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"RATES": (0.06, 0.02), "TRACKED": 20, "TRUED": 6}.items():
+        monkeypatch.setattr(skeleton_motion, name, value)
 
 
 def arm() -> tuple[Model, Skeleton]:
