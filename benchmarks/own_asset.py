@@ -229,13 +229,13 @@ def measure(
         vertices, flipped = animate(own, settings)
         found[name] = {**score(own, vertices, torch.from_numpy(own.model.faces)), "flipped": float(flipped)}
         still[name] = frozen(own)
-        show(_row(name, found[name]) + f"   {time.perf_counter() - begun:.0f} s")
-        show(_row("  truth, frozen", still[name]))
+        show(row(name, found[name]) + f"   {time.perf_counter() - begun:.0f} s")
+        show(row("  truth, frozen", still[name]))
         if sheets is not None:
             sheets.mkdir(parents=True, exist_ok=True)
-            true_views.write_sheet(sheets / f"{name}.png", [_sheet(own, vertices)])
-    show(_row("mean", mean(list(found.values()))))
-    show(_row("  truth, frozen", mean(list(still.values()))))
+            true_views.write_sheet(sheets / f"{name}.png", [sheet(own, vertices)])
+    show(row("mean", mean(list(found.values()))))
+    show(row("  truth, frozen", mean(list(still.values()))))
     return found
 
 
@@ -245,11 +245,12 @@ def write_line(text: str) -> None:
     sys.stdout.flush()
 
 
-def _row(name: str, figures: Figures) -> str:
+def row(name: str, figures: Figures) -> str:
+    """Return a line of the table."""
     return f"{name:24}" + "".join(f"{figures[column]:10.3f}" for column in COLUMNS)
 
 
-def _sheet(own: OwnModel, moved: Float[Tensor, "t v 3"], columns: int = 6, size: int = 288) -> Float[Tensor, "h w 3"]:
+def sheet(own: OwnModel, moved: Float[Tensor, "t v 3"], columns: int = 6, size: int = 288) -> Float[Tensor, "h w 3"]:
     """Draw some frames: for every view a row of the truth and one of ours."""
     frames = torch.linspace(0, len(moved) - 1, columns).round().long()
     rows = []

@@ -42,8 +42,16 @@ JOINT_NOTE = "The skeleton of the model moves it; how limbs turn where the video
 
 
 @dataclass(frozen=True)
-class _Mesh:
-    """Placed mesh of a model, and its control graph."""
+class PlacedMesh:
+    """Mesh of a model in the world.
+
+    Attributes:
+        glb: the model as given.
+        placement: of it in the world.
+        surface: covered with Gaussians, placed.
+        graph: nodes that move the vertices of the surface.
+        joints: the same, where they are joints of a skeleton.
+    """
 
     glb: ForeignGlb
     placement: Placement
@@ -65,7 +73,7 @@ def run(job: Job) -> StepReport:
         # covered in its own coordinates, as in prepare_asset: rows of `nearest` are rows of the Gaussians
         covered = cover_surface(glb.model, settings.points, torch.Generator().manual_seed(job.seed))
         surface = covered.placed(placement.quat, placement.scale, placement.shift)
-        mesh = _controlled(glb, placement, surface, settings)
+        mesh = controlled(glb, placement, surface, settings)
         graph = mesh.graph.of(surface.nearest)
     else:
         points = cloud.means.double().numpy()
@@ -92,14 +100,14 @@ def run(job: Job) -> StepReport:
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
-def _controlled(glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, settings: AssetSettings) -> _Mesh:
+def controlled(glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, settings: AssetSettings) -> PlacedMesh:
     """Return a mesh that its joints move where it was posed by them, and control nodes on its surface elsewhere."""
     skeleton = read_skeleton(glb) if placement.posed else None
     if skeleton is None:
         control = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
-        return _Mesh(glb, placement, surface, control, None)
+        return PlacedMesh(glb, placement, surface, control, None)
     joints = joint_graph(skeleton, surface, glb.model.faces, placement.matrix)
-    return _Mesh(glb, placement, surface, joints.graph, joints)
+    return PlacedMesh(glb, placement, surface, joints.graph, joints)
 
 
 def motion_note(motion: NodeMotion, most_parts: int) -> str:
@@ -169,7 +177,7 @@ def moved_vertices(
     return torch.from_numpy(np.stack(frames)), left
 
 
-def _write_mesh(job: Job, mesh: _Mesh, motion: NodeMotion, fps: float, note: str) -> list[str]:
+def _write_mesh(job: Job, mesh: PlacedMesh, motion: NodeMotion, fps: float, note: str) -> list[str]:
     """Write the model with morph targets, and as a tracked mesh with one texture; return notes."""
     vertices, flipped = moved_vertices(mesh.surface, mesh.graph, motion)
     gltf = job.settings.gltf

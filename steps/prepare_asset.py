@@ -56,7 +56,7 @@ def run(job: Job) -> StepReport:
         subject = read_png(job.inputs["subject"])
         placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
         if own.glb is not None and surface is not None and placement.agreement < POSED:
-            posed = _posed(own.glb, surface, subject, rasterize, settings, own.ups)
+            posed = posed_model(own.glb, surface, subject, rasterize, settings, own.ups)
     else:
         placement = centered_placement(cloud, settings.azimuth_deg, own.ups[0])
         subject = render_subject(placement.apply(cloud), job.settings.size, rasterize)
@@ -95,22 +95,31 @@ def cover(glb: ForeignGlb, settings: AssetSettings, seed: int) -> SurfaceCloud:
     return cover_surface(glb.model, settings.points, torch.Generator().manual_seed(seed))
 
 
-def _posed(
-    own: ForeignGlb,
+def posed_model(
+    glb: ForeignGlb,
     surface: SurfaceCloud,
     subject: Float[Tensor, "s s 4"],
     rasterize: Rasterizer,
     settings: AssetSettings,
     ups: Sequence[str],
 ) -> PosedModel | None:
-    """Return the model in the pose of the first frame, from the side that shows it best; None without a skeleton."""
-    skeleton = read_skeleton(own) if settings.skeleton else None
+    """Return the model in the pose of the first frame, from the side that shows it best; None without a skeleton.
+
+    Args:
+        glb: the model.
+        surface: of it, in its own coordinates.
+        subject: first frame, straight alpha.
+        rasterize: rasterizer.
+        settings: of the fit.
+        ups: axes that may point up.
+    """
+    skeleton = read_skeleton(glb) if settings.skeleton else None
     if skeleton is None:
         return None
     azimuth = None if settings.find_azimuth else settings.azimuth_deg
     found = []
     for placement in distinct_placements(surface.cloud, subject, rasterize, azimuth, ups):
-        joints = joint_graph(skeleton, surface, own.model.faces, placement.matrix).of(surface.nearest)
+        joints = joint_graph(skeleton, surface, glb.model.faces, placement.matrix).of(surface.nearest)
         found.append(pose_model(placement.apply(surface.cloud), joints, subject, placement, rasterize, settings))
     return min(found, key=lambda one: one.difference)
 

@@ -94,6 +94,17 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             return _mesh(write_model_glb(usd.read_usd(file, decode_picture, settings.max_faces)), settings)
 
 
+def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
+    """Read a GLB or glTF beside its files.
+
+    Raises:
+        BadInput: it cannot be used.
+    """
+    content = path.read_bytes()
+    content = content if path.suffix == ".glb" else _glb_of(content)
+    return read_foreign_glb(embed_files(content, path.parent), settings.max_faces)
+
+
 def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
     """Return a mesh where the file has faces, and splats where it has none."""
     if declared_faces(content):

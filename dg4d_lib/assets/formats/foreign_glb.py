@@ -117,6 +117,16 @@ def read_foreign_glb(content: bytes, max_faces: int) -> ForeignGlb:
         raise BadInput(f"the model is a broken glTF ({error!r}); export it again") from error
 
 
+def moved_pieces(glb: ForeignGlb) -> NDArray[np.float32]:
+    """Return the vertices of all pieces where the nodes of the file are now, in the coordinates of the model."""
+    globals_ = global_matrices(glb.reader.tree)
+    places = [
+        _transformed(mesh_matrices(glb.reader, piece.node, piece.primitive, globals_), piece.local.astype(np.float64))
+        for piece in glb.pieces
+    ]
+    return np.concatenate(places).astype(np.float32)
+
+
 def write_moving_glb(
     glb: ForeignGlb,
     placement: NDArray[np.float64],

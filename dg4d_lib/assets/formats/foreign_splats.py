@@ -34,10 +34,10 @@ def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[
         BadInput: the file is no splat PLY, lacks color, has too many splats or numbers that are not finite.
     """
     beginning = content[:MAX_HEADER]
-    header = beginning[: max(0, beginning.find(b"end_header"))].split()
-    if b"chunk" in header:
+    header = beginning[: max(0, beginning.find(b"end_header"))]
+    if b"\nelement chunk " in header:
         return _read_compressed_ply(content, max_splats)
-    if header and not {name.encode() for name in COLORS} <= set(header):
+    if header and not {name.encode() for name in COLORS} <= set(header.split()):
         raise BadInput(
             "the PLY has no faces and no splat colors (f_dc_0, f_dc_1, f_dc_2), and points alone cannot be animated; "
             "give splats with color, or a mesh"

@@ -6,7 +6,6 @@ that a small file cannot grow.
 
 import zipfile
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,8 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     if stage is None:
         raise BadInput("the USD file cannot be read; export it again")
     package = stage.GetRootLayer().realPath
-    if any(not layer.realPath.startswith(package) for layer in stage.GetUsedLayers() if not layer.anonymous):
+    layers = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
+    if any(layer != package and not layer.startswith(f"{package}[") for layer in layers):
         raise BadInput("the USD file refers to files outside of its package; pack them into the USDZ")
     start = stage.GetStartTimeCode()
     stage.SetEditTarget(stage.GetSessionLayer())
@@ -73,13 +73,16 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         upright = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     parts: list[ModelPart] = []
+    faces, pictures = 0, _Pictures(package, decode)
     for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
         if number >= MAX_PRIMS:
             raise BadInput(f"the USD file has more than {MAX_PRIMS} objects; simplify it")
         if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
-        parts += _parts(UsdGeom.Mesh(prim), time, cache, upright, partial(_picture, package, decode))
-        if sum(len(part.faces) for part in parts) > max_faces:
+        found = list(_parts(UsdGeom.Mesh(prim), time, cache, upright, pictures))
+        parts += found
+        faces += sum(len(part.faces) for part in found)
+        if faces > max_faces:
             raise BadInput(
                 f"the model has more than {max_faces} triangles, the limit asset.max_faces: simplify it, or raise the "
                 "limit with --set asset.max_faces=N"
@@ -92,7 +95,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
 
 
 def _parts(
-    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], read: Callable[[Any], NDArray[np.uint8]]
+    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], pictures: "_Pictures"
 ) -> Iterator[ModelPart]:
     """Return a part for every material of a mesh."""
     prim = mesh.GetPrim()
@@ -116,7 +119,7 @@ def _parts(
         triangles = corners[chosen[polygons]]
         if not len(triangles):
             continue
-        color = _material(owner, read)
+        color = _material(owner, pictures)
         shown = colors if color is None else None
         texture, factor = (None, GRAY if shown is None else (1.0, 1.0, 1.0)) if color is None else color
         coordinates = uvs if texture is not None else None
@@ -175,9 +178,7 @@ def _per_corner(prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], t
     return None
 
 
-def _material(
-    prim: Any, read: Callable[[Any], NDArray[np.uint8]]
-) -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]] | None:
+def _material(prim: Any, pictures: "_Pictures") -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]] | None:
     """Return the base color texture and the linear base color of a prim's material; None if it has no color."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0] if material else None
@@ -189,13 +190,23 @@ def _material(
         return None if value is None else (None, (float(value[0]), float(value[1]), float(value[2])))
     file = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim()).GetInput("file")
     picture = file.Get() if file else None
-    return None if picture is None else (read(picture), GRAY)
+    return None if picture is None else (pictures.read(picture), GRAY)
 
 
-def _picture(package: str, decode: Decode, picture: Any) -> NDArray[np.uint8]:
-    """Return a texture in the package."""
-    inside = picture.resolvedPath.startswith(f"{package}[")
-    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(picture.resolvedPath)) if inside else None
-    if asset is None:
-        raise BadInput(f"the texture {picture.path[:80]!r} of the model is missing; pack it into the USDZ")
-    return decode(bytes(asset.GetBuffer()), picture.path)
+class _Pictures:
+    """Textures in a package, each decoded once."""
+
+    def __init__(self, package: str, decode: Decode) -> None:
+        self.package, self.decode = package, decode
+        self.decoded: dict[str, NDArray[np.uint8]] = {}
+
+    def read(self, picture: Any) -> NDArray[np.uint8]:
+        """Return a texture by its asset path."""
+        path = picture.resolvedPath
+        if path not in self.decoded:
+            inside = path.startswith(f"{self.package}[")
+            asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)) if inside else None
+            if asset is None:
+                raise BadInput(f"the texture {picture.path[:80]!r} of the model is missing; pack it into the USDZ")
+            self.decoded[path] = self.decode(bytes(asset.GetBuffer()), picture.path)
+        return self.decoded[path]

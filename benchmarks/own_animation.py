@@ -1,0 +1,170 @@
+"""A rigged model driven by renders of an animation of its own: what `--asset` finds of it, beside the frozen truth.
+
+    python -m benchmarks.own_animation MODEL.glb ... [--animation RUN] [--azimuth DEG] [--frames N] [--sheets DIR]
+    python -m benchmarks.own_animation MODEL.glb --set asset.skeleton=false
+
+The model rests as its file has it, and the video is what the input camera sees of the animation, by name or number.
+Columns and figures are those of `benchmarks.own_asset`.
+"""
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import own_asset
+from benchmarks.measure import parser_of
+from benchmarks.own_asset import COLUMNS, FPS, OwnModel, draw_model, write_line
+from benchmarks.true_views import SIZE, Figures, Subject, mean, write_sheet
+
+import numpy as np  # isort: skip
+import torch  # isort: skip
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, moved_pieces
+from dg4d_lib.assets.formats.gltf import read_accessor
+from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.asset_motion import fit_asset_motion
+from dg4d_lib.fitting.asset_pose import find_placement
+from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.video.driving import DrivingVideo
+from steps.animate_asset import controlled, moved_vertices
+from steps.prepare_asset import POSED, cover, posed_model
+from steps.profiles import PREVIEW, revise
+from steps.sources.models import read_mesh
+
+AZIMUTHS = (-75.0, 15.0, 105.0, 195.0)
+SPAN = 0.75  # of the frame, that the animation fills
+DRAWN = 2 * SIZE  # pixels of the video
+
+
+def played(glb: ForeignGlb, animation: str, frames: int) -> Float[np.ndarray, "t v 3"]:
+    """Return the vertices of a model at evenly spaced moments of an animation, in its own coordinates.
+
+    Args:
+        glb: the model; its nodes are moved.
+        animation: name or number.
+        frames: number of moments.
+
+    Raises:
+        BadInput: there is no such animation.
+    """
+    animations = glb.reader.tree.get("animations", [])
+    names = [str(one.get("name", number)) for number, one in enumerate(animations)]
+    if animation not in names and not (animation.isdigit() and int(animation) < len(animations)):
+        raise BadInput(f"the model has no animation {animation!r}; given are {', '.join(names) or 'none'}")
+    chosen = animations[names.index(animation) if animation in names else int(animation)]
+    tracks = [_track(glb, chosen, channel) for channel in chosen["channels"] if channel["target"]["path"] != "weights"]
+    end = max(float(times[-1]) for _, _, times, _ in tracks)
+    moments = []
+    for frame in range(frames):
+        for node, path, times, values in tracks:
+            glb.reader.tree["nodes"][node].pop("matrix", None)
+            glb.reader.tree["nodes"][node][path] = _between(times, values, end * frame / frames, path).tolist()
+        moments.append(moved_pieces(glb))
+    return np.stack(moments)
+
+
+def _track(glb: ForeignGlb, animation: dict[str, Any], channel: dict[str, Any]) -> tuple[int, str, Any, Any]:
+    sampler = animation["samplers"][channel["sampler"]]
+    times, values = read_accessor(glb.reader, sampler["input"])[:, 0], read_accessor(glb.reader, sampler["output"])
+    if sampler.get("interpolation") == "CUBICSPLINE":
+        values = values.reshape(len(times), 3, -1)[:, 1]  # without the tangents
+    return channel["target"]["node"], channel["target"]["path"], times, values.astype(np.float64)
+
+
+def _between(
+    times: Float[np.ndarray, " k"], values: Float[np.ndarray, "k c"], moment: float, path: str
+) -> Float[np.ndarray, " c"]:
+    """Return the value at a moment, along a straight line between two keys."""
+    after = int(np.searchsorted(times, moment).clip(1, max(len(times) - 1, 1)))
+    first, second = values[after - 1], values[min(after, len(times) - 1)]
+    if path == "rotation" and first @ second < 0:
+        second = -second
+    gap = float(times[min(after, len(times) - 1)] - times[after - 1])
+    share = float(np.clip((moment - times[after - 1]) / gap, 0, 1)) if gap > 0 else 0.0
+    mixed: Float[np.ndarray, " c"] = (1 - share) * first + share * second
+    return mixed / np.linalg.norm(mixed) if path == "rotation" else mixed
+
+
+def read_rigged(path: Path, animation: str, frames: int, azimuth: float) -> tuple[OwnModel, ForeignGlb]:
+    """Return a model at rest, with the video and the true views of one of its animations."""
+    glb, rest = read_mesh(path, PREVIEW.asset), read_mesh(path, PREVIEW.asset)
+    moved = played(glb, animation, frames)
+    turn = math.radians(-azimuth) / 2
+    turned = moved @ quat_to_rotmat(torch.tensor([math.cos(turn), 0.0, math.sin(turn), 0.0])).numpy().T
+    low, high = turned.reshape(-1, 3).min(0), turned.reshape(-1, 3).max(0)
+    half = math.tan(math.radians(OrbitCamera().fov_y_deg) / 2) * RADIUS * SPAN
+    world = torch.from_numpy((turned - (low + high) / 2) * (half / (0.5 * max((high - low)[:2]))))
+    model, cameras = rest.model, [OrbitCamera(0, one, width=SIZE, height=SIZE) for one in AZIMUTHS]
+    footage = draw_model(model, world, OrbitCamera(width=DRAWN, height=DRAWN))
+    views = {one: draw_model(model, world, camera) for one, camera in zip(AZIMUTHS, cameras, strict=True)}
+    faces = torch.from_numpy(model.faces).long()
+    own = OwnModel(Subject(path.stem, footage, views), model, world.float(), faces, torch.ones(len(faces)))
+    return own, rest
+
+
+def animate(
+    own: OwnModel, glb: ForeignGlb, settings: AssetSettings
+) -> tuple[Float[Tensor, "t v 3"], Int[Tensor, "f 3"], str]:
+    """Place the model, pose it and fit its motion, as the steps do; also tell how."""
+    rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
+    footage, whole = own.subject.footage, cover(glb, settings, 0)
+    placement = find_placement(whole.cloud, footage[0], rasterize)
+    said = f"outlines {placement.agreement:.3f}"
+    posed = (
+        posed_model(glb, whole, footage[0], rasterize, settings, ("y",)) if placement.agreement < POSED else None
+    )  # fmt: skip
+    if posed is not None and posed.placement.agreement > placement.agreement:
+        placement = posed.placement
+        said += f" at rest, {placement.agreement:.3f} posed"
+    surface = whole.placed(placement.quat, placement.scale, placement.shift)
+    mesh = controlled(glb, placement, surface, settings)
+    video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
+    if mesh.joints is None:
+        bound = mesh.graph.of(surface.nearest)
+        motion = fit_asset_motion(surface.cloud, bound, video, rasterize, settings, generator)
+    else:
+        joints = mesh.joints.of(surface.nearest)
+        motion = fit_skeleton_motion(surface.cloud, joints, video, rasterize, settings, generator)
+    return moved_vertices(surface, mesh.graph, motion)[0], torch.from_numpy(own.model.faces).long(), said
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure models, each by one of its animations."""
+    parser = parser_of(__doc__)
+    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("--animation", default="0", help="name or number")
+    parser.add_argument("--azimuth", type=float, default=30.0, help="of the model, from which the video shows it")
+    parser.add_argument("--frames", type=int, default=32)
+    parser.add_argument("--set", nargs="+", default=(), metavar="KEY=VALUE", help="settings of the fit")
+    parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each")
+    given = parser.parse_args(arguments)
+    settings = revise(PREVIEW, dict(one.split("=", 1) for one in given.set)).asset
+    found: dict[str, Figures] = {}
+    write_line(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
+    for path in given.models:
+        own, glb = read_rigged(path, given.animation, given.frames, given.azimuth)
+        begun = time.perf_counter()
+        vertices, faces, said = animate(own, glb, settings)
+        seconds = time.perf_counter() - begun
+        found[path.stem] = {**own_asset.score(own, vertices, faces), "flipped": 0.0}
+        write_line(own_asset.row(path.stem, found[path.stem]) + f"   {seconds:.0f} s, {said}")
+        write_line(own_asset.row("  truth, frozen", own_asset.frozen(own)))
+        if given.sheets is not None:
+            given.sheets.mkdir(parents=True, exist_ok=True)
+            write_sheet(given.sheets / f"{path.stem}.png", [own_asset.sheet(own, vertices)])
+    write_line(own_asset.row("mean", mean(list(found.values()))))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
