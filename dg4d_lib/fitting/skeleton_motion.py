@@ -38,6 +38,7 @@ FINER, TRACKING = 0.01, 0.02  # rates of the finer steps at the first frame and 
 FACTORS = {"turns": 2.0, "whole_turn": 0.5, "whole_shift": 0.2, "whole_depth": 0.4}  # of the rates
 EVENNESS = 0.5  # of the steps of all joints: 1 leaves weak gradients weak, 0 makes them as strong as others
 AT_REST, AS_BEFORE = 0.002, 0.002  # weights of rotations, and of their changes while tracking
+WHOLE_DEPTH = 0.15  # weight of the depth of the whole in a video, as of other descents
 STEADY = 0.01  # weight of accelerations of the rotations
 CONTINUED = 0.7  # share of the last motion that goes on
 Report = Callable[[int, dict[str, float]], None]
@@ -151,7 +152,8 @@ def fit_skeleton_motion(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    search = _Search(cloud, joints, video, rasterize, settings, report)
+    steady = settings.model_copy(update={"whole_depth": max(settings.whole_depth, WHOLE_DEPTH)})
+    search = _Search(cloud, joints, video, rasterize, steady, report)
     poses = [search.first_pose()]
     for frame in range(1, len(video)):
         start = poses[-1] if frame == 1 else poses[-1].continued(poses[-2])

@@ -235,18 +235,19 @@ def test_a_skinned_model_is_posed_as_the_first_frame_shows_it_and_its_joints_mov
 ) -> None:
     for name, value in {"RATES": (0.06,), "FINISHED": 20, "TRACKED": 20, "TRUED": 5}.items():
         monkeypatch.setattr(skeleton_motion, name, value)
+    finer = revise(SMALL, {"asset.size": 48, "asset.points": 1200, "asset.fit_points": 1200})
     angles = np.array([1.3, 1.1, 0.9])
     frames = torch.stack([render(bent_arm(angle), 0.0) for angle in angles])
     write_png(tmp_path / "subject.png", frames[0])
     path = zipped(tmp_path, model_glb=arm_glb())
-    prepare = job_of("prepare_asset", tmp_path / "prepare", {"model": path, "subject": tmp_path / "subject.png"})
+    prepare = job_of("prepare_asset", tmp_path / "prepare", {"model": path, "subject": tmp_path / "subject.png"}, finer)
     report = prepare_asset.run(prepare)
     placement = read_placement(prepare.outputs["placement"])
     assert placement.posed and placement.agreement > 0.8
     assert prepare_asset.POSE_NOTE in report.notes
     write_frames(tmp_path / "video", DrivingVideo(frames[..., :3], frames[..., 3:], 10.0))
     inputs = {name: prepare.outputs[name] for name in ("gaussians", "glb", "placement")}
-    animate = job_of("animate_asset", tmp_path / "animate", {**inputs, "driving_video": tmp_path / "video"})
+    animate = job_of("animate_asset", tmp_path / "animate", {**inputs, "driving_video": tmp_path / "video"}, finer)
     notes = animate_asset.run(animate).notes
     assert animate_asset.JOINT_NOTE in notes
     moving = read_foreign_glb(animate.outputs["moving"].read_bytes(), 1000)
