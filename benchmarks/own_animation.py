@@ -21,7 +21,7 @@ from benchmarks.true_views import SIZE, Figures, Subject, mean, write_sheet
 
 import numpy as np  # isort: skip
 import torch  # isort: skip
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
@@ -36,7 +36,7 @@ from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.animate_asset import controlled, moved_vertices
-from steps.prepare_asset import POSED, cover, posed_model
+from steps.prepare_asset import cover, posed_model
 from steps.profiles import PREVIEW, revise
 from steps.sources.models import read_mesh
 
@@ -111,18 +111,14 @@ def read_rigged(path: Path, animation: str, frames: int, azimuth: float) -> tupl
     return own, rest
 
 
-def animate(
-    own: OwnModel, glb: ForeignGlb, settings: AssetSettings
-) -> tuple[Float[Tensor, "t v 3"], Int[Tensor, "f 3"], str]:
+def animate(own: OwnModel, glb: ForeignGlb, settings: AssetSettings) -> tuple[Float[Tensor, "t v 3"], str]:
     """Place the model, pose it and fit its motion, as the steps do; also tell how."""
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
     footage, whole = own.subject.footage, cover(glb, settings, 0)
     placement = find_placement(whole.cloud, footage[0], rasterize)
     said = f"outlines {placement.agreement:.3f}"
-    posed = (
-        posed_model(glb, whole, footage[0], rasterize, settings, ("y",)) if placement.agreement < POSED else None
-    )  # fmt: skip
-    if posed is not None and posed.placement.agreement > placement.agreement:
+    posed = posed_model(glb, whole, placement, footage[0], rasterize, settings, ("y",))
+    if posed is not None:
         placement = posed.placement
         said += f" at rest, {placement.agreement:.3f} posed"
     surface = whole.placed(placement.quat, placement.scale, placement.shift)
@@ -134,7 +130,7 @@ def animate(
     else:
         joints = mesh.joints.of(surface.nearest)
         motion = fit_skeleton_motion(surface.cloud, joints, video, rasterize, settings, generator)
-    return moved_vertices(surface, mesh.graph, motion)[0], torch.from_numpy(own.model.faces).long(), said
+    return moved_vertices(surface, mesh.graph, motion)[0], said
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,9 +149,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path in given.models:
         own, glb = read_rigged(path, given.animation, given.frames, given.azimuth)
         begun = time.perf_counter()
-        vertices, faces, said = animate(own, glb, settings)
+        vertices, said = animate(own, glb, settings)
         seconds = time.perf_counter() - begun
-        found[path.stem] = {**own_asset.score(own, vertices, faces), "flipped": 0.0}
+        found[path.stem] = {**own_asset.score(own, vertices, own.faces), "flipped": 0.0}
         write_line(own_asset.row(path.stem, found[path.stem]) + f"   {seconds:.0f} s, {said}")
         write_line(own_asset.row("  truth, frozen", own_asset.frozen(own)))
         if given.sheets is not None:

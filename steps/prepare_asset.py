@@ -55,18 +55,16 @@ def run(job: Job) -> StepReport:
     if "subject" in job.inputs:
         subject = read_png(job.inputs["subject"])
         placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
-        if own.glb is not None and surface is not None and placement.agreement < POSED:
-            posed = posed_model(own.glb, surface, subject, rasterize, settings, own.ups)
+        if own.glb is not None and surface is not None:
+            posed = posed_model(own.glb, surface, placement, subject, rasterize, settings, own.ups)
     else:
         placement = centered_placement(cloud, settings.azimuth_deg, own.ups[0])
         subject = render_subject(placement.apply(cloud), job.settings.size, rasterize)
         write_png(job.outputs["subject"], subject)
     both = picture_of_both(cloud, placement, subject, rasterize)
-    if posed is not None and posed.placement.agreement > placement.agreement:
+    if posed is not None:
         placement = posed.placement
-        both = picture_of_both(
-            posed.cloud, Placement(torch.tensor((1.0, 0, 0, 0)), 1.0, torch.zeros(3)), subject, rasterize
-        )
+        both = picture_of_both(posed.cloud, Placement.identity(), subject, rasterize)
     if "subject" in job.inputs and placement.agreement < settings.min_agreement:
         write_png(job.pictures / "model_and_subject.png", both)
         raise BadInput(_disagreement(placement, settings))
@@ -98,22 +96,26 @@ def cover(glb: ForeignGlb, settings: AssetSettings, seed: int) -> SurfaceCloud:
 def posed_model(
     glb: ForeignGlb,
     surface: SurfaceCloud,
+    at_rest: Placement,
     subject: Float[Tensor, "s s 4"],
     rasterize: Rasterizer,
     settings: AssetSettings,
     ups: Sequence[str],
 ) -> PosedModel | None:
-    """Return the model in the pose of the first frame, from the side that shows it best; None without a skeleton.
+    """Return the model in the pose of the first frame, from the side that shows it best.
+
+    None where it agrees as it rests, has no skeleton, or does not agree better in any pose.
 
     Args:
         glb: the model.
         surface: of it, in its own coordinates.
+        at_rest: placement of the model in the pose that it rests in.
         subject: first frame, straight alpha.
         rasterize: rasterizer.
         settings: of the fit.
         ups: axes that may point up.
     """
-    skeleton = read_skeleton(glb) if settings.skeleton else None
+    skeleton = read_skeleton(glb) if settings.skeleton and at_rest.agreement < POSED else None
     if skeleton is None:
         return None
     azimuth = None if settings.find_azimuth else settings.azimuth_deg
@@ -121,7 +123,8 @@ def posed_model(
     for placement in distinct_placements(surface.cloud, subject, rasterize, azimuth, ups):
         joints = joint_graph(skeleton, surface, glb.model.faces, placement.matrix).of(surface.nearest)
         found.append(pose_model(placement.apply(surface.cloud), joints, subject, placement, rasterize, settings))
-    return min(found, key=lambda one: one.difference)
+    best = min(found, key=lambda one: one.difference)
+    return best if best.placement.agreement > at_rest.agreement else None
 
 
 def _disagreement(placement: Placement, settings: AssetSettings) -> str:

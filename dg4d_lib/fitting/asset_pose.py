@@ -59,6 +59,11 @@ class Placement:
     color_error: float = 0.0
     posed: bool = False
 
+    @classmethod
+    def identity(cls) -> "Placement":
+        """Return the placement of a model that is in the world as it stands."""
+        return cls(torch.tensor(UPRIGHT["y"]), 1.0, torch.zeros(3))
+
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """Affine matrix, float64."""
@@ -113,7 +118,7 @@ def find_placement(
     """
     sparse, best = _searched(cloud, subject, rasterize, azimuth_deg, ups)
     refined = [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in best[:KEPT]]
-    as_it_stands = Placement(torch.tensor(UPRIGHT["y"]), 1.0, torch.zeros(3))
+    as_it_stands = Placement.identity()
     tried = [*refined, *([as_it_stands] if not azimuth_deg else [])]
     results = judge(cloud, tried, subject, rasterize, FINE_SIZE)
     found = max(results[: len(refined)], key=lambda one: one.score)

@@ -80,10 +80,8 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
         case ".spz":
             splats, notes = read_spz(file.read_bytes(), settings.max_splats)
             return OwnModel(splats=splats, ups=("y", "-y"), notes=notes)
-        case ".glb":
-            return _mesh(embed_files(file.read_bytes(), file.parent), settings)
-        case ".gltf":
-            return _mesh(embed_files(_glb_of(file.read_bytes()), file.parent), settings)
+        case ".glb" | ".gltf":
+            return _mesh(_whole_glb(file), settings)
         case ".obj":
             text = file.read_bytes().decode("utf-8", "replace")
             model = read_obj(text, lambda name: _beside(file.parent, name), decode_picture, settings.max_faces)
@@ -100,9 +98,13 @@ def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
     Raises:
         BadInput: it cannot be used.
     """
-    content = path.read_bytes()
-    content = content if path.suffix == ".glb" else _glb_of(content)
-    return read_foreign_glb(embed_files(content, path.parent), settings.max_faces)
+    return read_foreign_glb(_whole_glb(path), settings.max_faces)
+
+
+def _whole_glb(file: Path) -> bytes:
+    """Return a GLB or glTF with the files beside it in its binary chunk."""
+    content = file.read_bytes()
+    return embed_files(content if file.suffix == ".glb" else _glb_of(content), file.parent)
 
 
 def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:

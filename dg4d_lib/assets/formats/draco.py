@@ -20,15 +20,17 @@ def unpack_draco(reader: GlbReader) -> None:
         BadInput: a mesh cannot be decompressed.
         KeyError, IndexError, TypeError, ValueError, AttributeError: the JSON is broken.
     """
-    tree, unpacked = reader.tree, _Unpacked(reader)
-    for mesh in tree.get("meshes", ()):
-        for primitive in mesh["primitives"]:
-            packed = primitive.get("extensions", {}).pop(EXTENSION, None)
-            if packed is not None:
-                unpacked.add(primitive, packed)
+    tree = reader.tree
     for names in (tree.get("extensionsUsed", []), tree.get("extensionsRequired", [])):
         if EXTENSION in names:
             names.remove(EXTENSION)
+    primitives = [primitive for mesh in tree.get("meshes", ()) for primitive in mesh["primitives"]]
+    compressed = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]
+    if not compressed:
+        return
+    unpacked = _Unpacked(reader)
+    for primitive in compressed:
+        unpacked.add(primitive, primitive["extensions"].pop(EXTENSION))
     reader.binary = bytes(unpacked.binary)
     if "buffers" in tree:
         tree["buffers"][0]["byteLength"] = len(reader.binary)

@@ -17,18 +17,17 @@ def read_skeleton(glb: ForeignGlb) -> Skeleton | None:
     tree = glb.reader.tree
     skins = [skin_of(tree, piece.node, piece.primitive) for piece in glb.pieces]
     rest = global_matrices(tree)
-    parents = parents_of(tree, rest)
-    joints, movers = joints_and_movers(rest, parents, {joint for skin in skins if skin for joint in skin["joints"]})
+    used = {joint for skin in skins if skin for joint in skin["joints"]}
+    joints, movers, above = joints_and_movers(rest, parents_of(tree, rest), used)
     if not 0 < len(joints) <= MOST_JOINTS:
         return None
-    number = {joint: index for index, joint in enumerate(joints)}
     entries: list[Float[np.ndarray, "n 3"]] = []  # row, column and value of the weights
     start = 0
     for piece, skin in zip(glb.pieces, skins, strict=True):
         rows = np.arange(start, start := start + len(piece.local))
         if skin is not None:
             indices, weights = skin_weights(glb.reader, mesh_attributes(tree, piece.node, piece.primitive))
-            columns = np.array([number[joint] for joint in skin["joints"]])[indices]
+            columns = np.array([movers[joint] for joint in skin["joints"]])[indices]
             entries.append(np.stack([np.repeat(rows, weights.shape[1]), columns.ravel(), weights.ravel()], 1))
         elif piece.node in movers:
             entries.append(np.stack([rows, np.full(len(rows), movers[piece.node]), np.ones(len(rows))], 1))
@@ -40,5 +39,4 @@ def read_skeleton(glb: ForeignGlb) -> Skeleton | None:
     places = np.stack([rest[joint][:3, 3] for joint in joints])
     if not np.isfinite(places).all():
         return None
-    above = [movers.get(parents[joint], -1) if joint in parents else -1 for joint in joints]
     return Skeleton(places, np.array(above), sparse)

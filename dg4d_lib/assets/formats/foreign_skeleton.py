@@ -114,17 +114,15 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
     Raises:
         SkeletonAtRest: there are no or too many joints, or they would not show more of the motion than none.
     """
-    joints, movers = joints_and_movers(rest, parents, {joint for one in skinned for joint in one.joints})
+    joints, movers, above = joints_and_movers(rest, parents, {joint for one in skinned for joint in one.joints})
     if len(joints) > MOST_JOINTS:
         raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are moved")
-    number = {joint: index for index, joint in enumerate(joints)}
-    weights = [_by_joint(one, number) for one in skinned]
+    weights = [_by_joint(one, movers, len(joints)) for one in skinned]
     if not any(one.any() for one in weights):
         raise SkeletonAtRest("it moves no vertex")
     start = np.concatenate([one.rest for one in skinned]).astype(np.float64)
     moved = np.concatenate([one.moved for one in skinned], 1).swapaxes(0, 1) - start[:, None]
     known = np.concatenate(weights).any(1)
-    above = [movers.get(parents[joint], -1) if joint in parents else -1 for joint in joints]
     still = _at_rest(np.stack([rest[joint][:3, 3] for joint in joints]), above, moved.shape[1])
     padded = np.pad(np.concatenate(weights), ((0, 0), (1, 0)))  # none of the bone that all roots hang on
     maps = _fitted(still, start[known], moved[known], padded[known])
@@ -137,8 +135,9 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
 
 def joints_and_movers(
     rest: Matrices, parents: Mapping[int, int], used: Set[int]
-) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Return the joints, parents before their children, and the number of the joint that a node moves with, if any.
+) -> tuple[tuple[int, ...], dict[int, int], list[int]]:
+    """Return the joints, parents before their children; the number of the joint that a node moves with, if any; and
+    the number of the joint above each joint, -1 for none.
 
     Args:
         rest: global matrix of every node, parents before their children.
@@ -153,7 +152,7 @@ def joints_and_movers(
             movers[node] = number[node]
         elif parents.get(node) in movers:
             movers[node] = movers[parents[node]]
-    return joints, movers
+    return joints, movers, [movers.get(parents.get(joint, -1), -1) for joint in joints]
 
 
 def _fitted(
@@ -188,10 +187,10 @@ def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int
     return Articulation(parents, joints, still, np.repeat(joints[:1], frames, 0))
 
 
-def _by_joint(skinned: SkinnedVertices, number: Mapping[int, int]) -> Float[np.ndarray, "v k"]:
-    """Return the weights of all joints at every vertex."""
-    columns = np.array([number[joint] for joint in skinned.joints])
-    dense = np.zeros((len(skinned.indices), len(number)))
+def _by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -> Float[np.ndarray, "v k"]:
+    """Return the weights of all joints, so many, at every vertex."""
+    columns = np.array([movers[joint] for joint in skinned.joints])
+    dense = np.zeros((len(skinned.indices), count))
     np.add.at(dense, (np.arange(len(dense))[:, None], columns[skinned.indices]), skinned.weights)
     return dense
 

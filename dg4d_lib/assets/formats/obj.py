@@ -109,7 +109,7 @@ class _Content:
         for group in self.groups.values():
             if group.corners:
                 known = self.materials.get(group.material, Material())
-                texture = _texture(known.textures, self.read, decode, pictures)
+                texture = read_texture(known.textures, self.read, decode, pictures)
                 parts.append(_part(group, points, coordinates, colored, known, texture))
         return Model(tuple(parts))
 
@@ -132,7 +132,7 @@ def _index(text: str, count: int) -> int:
     return value - 1 if value >= 0 else count + value
 
 
-def _texture(
+def read_texture(
     names: tuple[str, ...], read: Read, decode: Decode, pictures: dict[str, NDArray[np.uint8]]
 ) -> NDArray[np.uint8] | None:
     """Return the picture of the first of the names that is there, None without names."""

@@ -3,19 +3,16 @@
 import io
 import re
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from dg4d_lib.assets.formats.obj import Decode, Read, read_texture
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.ply import MAX_HEADER
 from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
 
-Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
-Decode = Callable[[bytes, str], NDArray[np.uint8]]
 _FACES = re.compile(rb"^element face (\d+)", re.MULTILINE)
 _TEXTURE = re.compile(rb"^comment TextureFile\s+(.+?)\s*$", re.MULTILINE)
 _BROKEN = (ValueError, KeyError, IndexError, TypeError, AttributeError, ArithmeticError, OSError, struct.error)
@@ -75,12 +72,8 @@ def _part(mesh: Any, texture: str | None, read: Read, decode: Decode) -> ModelPa
     if kind == "face":
         mesh.unmerge_vertices()
     colors = to_linear(mesh.visual.vertex_colors[:, :3] / 255) if kind in ("vertex", "face") else None
-    picture = None
-    if texture is not None and uvs is not None:
-        data = read(texture)
-        if data is None:
-            raise BadInput(f"the texture {texture[:80]!r} of the model is missing; put it beside the model")
-        picture = decode(data, texture)
+    names = (texture,) if texture is not None and uvs is not None else ()
+    picture = read_texture(names, read, decode, {})
     vertices = np.asarray(mesh.vertices, np.float32)
     if not np.isfinite(vertices).all():
         raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
