@@ -176,7 +176,7 @@ class AssetSettings(Settings):
         0.0, ge=-360, le=360, description="azimuth of the model that the video shows, 0 on its +z; `--asset-azimuth`"
     )
     max_faces: int = Field(200000, ge=100, le=2000000, description="largest number of triangles of a model")
-    max_splats: int = Field(100000, ge=100, le=1000000, description="largest number of splats of a model")
+    max_splats: int = Field(100000, ge=100, le=1000000, description="splats of a model; more are merged to so many")
     min_agreement: Share = Field(
         0.5, description="smallest IoU of the outlines of model and first frame; below, the model is refused"
     )

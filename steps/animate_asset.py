@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
@@ -17,6 +18,7 @@ from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.fitting.rigid_parts import keep_pieces_whole
 from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion, skeleton_iterations
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.merging import merge_gaussians
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
 from dg4d_lib.mesh.models.atlas import merge_parts
@@ -75,9 +77,11 @@ def run(job: Job) -> StepReport:
         surface = covered.placed(placement.quat, placement.scale, placement.shift)
         mesh = controlled(glb, placement, surface, settings)
         graph = mesh.graph.of(surface.nearest)
+        fitted, bound = cloud, graph
     else:
         points = cloud.means.double().numpy()
         graph = graph_of_points(points, point_graph(points), settings.nodes)
+        fitted, bound = merged_graph(cloud, graph, settings.fit_points)
     joints = mesh.joints if mesh else None
     count = (iterations if joints is None else skeleton_iterations)(settings, len(video))
     curves, generator = LossCurves(count, job.progress), torch.Generator().manual_seed(job.seed)
@@ -86,7 +90,7 @@ def run(job: Job) -> StepReport:
             gaussians = joints.of(mesh.surface.nearest)
             motion = fit_skeleton_motion(cloud, gaussians, video, rasterize, settings, generator, curves.add)
         else:
-            motion = fit_asset_motion(cloud, graph, video, rasterize, settings, generator, curves.add)
+            motion = fit_asset_motion(fitted, bound, video, rasterize, settings, generator, curves.add)
     if mesh and joints is None:
         mesh = replace(mesh, graph=moving_graph(mesh.graph, motion, settings.rigid_parts, mesh.surface.fine.faces))
         graph = mesh.graph.of(mesh.surface.nearest)
@@ -108,6 +112,13 @@ def controlled(glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, set
         return PlacedMesh(glb, placement, surface, control, None)
     joints = joint_graph(skeleton, surface, glb.model.faces, placement.matrix)
     return PlacedMesh(glb, placement, surface, joints.graph, joints)
+
+
+def merged_graph(cloud: Gaussians, graph: ControlGraph, most: int) -> tuple[Gaussians, ControlGraph]:
+    """Merge splats down to a number for the fit; return them with their graph, which is that of the nearest splats."""
+    merged = merge_gaussians(cloud, most)
+    nearest = cKDTree(cloud.means.numpy()).query(merged.means.numpy())[1]
+    return merged, graph.of(torch.as_tensor(nearest, dtype=torch.long))
 
 
 def motion_note(motion: NodeMotion, most_parts: int) -> str:

@@ -1,7 +1,7 @@
 """Step that checks a package against the quality gates."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,7 +17,7 @@ from dg4d_lib.assets.rendering.sheet import draw_tiles
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.fitting.losses import resize_cutouts
-from dg4d_lib.images import color_over_white
+from dg4d_lib.images import color_over_white, resize
 from dg4d_lib.mesh.extraction.topology import check_topology, join_seams, weld_vertices
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.metrics.gates import MESH, SPLATS, GateInputs, RgbaImages, Turntable, evaluate_gates, fidelity
@@ -32,6 +32,7 @@ from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, rea
 from steps.runtime.job import Job, StepReport
 
 SIZE = 128  # pixels of a side of the renders; the bounds of the gates were calibrated at this size
+SUPERSAMPLE = 2  # of splats seen from the input view: the rasterizer's low-pass filter widens small ones by a pixel
 MOST_FRAMES = 32  # frames of the video that are compared, evenly spaced
 TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
@@ -106,6 +107,7 @@ def collect_evidence(
     frames = _spread(len(video), MOST_FRAMES)
     positions = frames * asset.frames / len(video)
     front = OrbitCamera(width=SIZE, height=SIZE)
+    sharp = replace(front, width=SUPERSAMPLE * SIZE, height=SUPERSAMPLE * SIZE)
     timestamps = positions[_spread(len(frames), TIMESTAMPS).long()]
     sides = [OrbitCamera(elevation_deg, azimuth_deg, width=SIZE, height=SIZE) for elevation_deg, azimuth_deg in SIDES]
     ring = turntable(TURN, front)
@@ -124,7 +126,8 @@ def collect_evidence(
 
     seen, around = {}, {}
     for form, draw in ((SPLATS, splats), (MESH, triangles)):
-        seen[form] = _pictures(_drawn(draw, positions, [front] * len(positions)))
+        drawn = _drawn(draw, positions, [sharp if form == SPLATS else front] * len(positions))
+        seen[form] = _pictures(resize(drawn[..., :4], (SIZE, SIZE)))
         around[form] = _pictures(_drawn(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps)))
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
     flaws, folds = _worst_defects(asset, timestamps)

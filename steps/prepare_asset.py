@@ -14,6 +14,7 @@ from dg4d_lib.assets.formats.foreign_joints import read_skeleton
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.asset_pose import (
+    SEARCHED,
     Placement,
     centered_placement,
     distinct_placements,
@@ -22,7 +23,9 @@ from dg4d_lib.fitting.asset_pose import (
 )
 from dg4d_lib.fitting.skeleton_motion import PosedModel, pose_model
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.merging import merge_gaussians
 from dg4d_lib.gaussians.ply import write_ply
+from dg4d_lib.images import resize
 from dg4d_lib.mesh.models.skeleton import joint_graph
 from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud, cover_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
@@ -33,6 +36,7 @@ from steps.runtime.job import Job, StepReport
 from steps.sources.models import OwnModel, read_model
 
 POSED = 0.9  # IoU of the outlines of model and first frame below which the model is posed, not only placed
+SUPERSAMPLE = 2  # of the render that becomes the subject: the rasterizer's low-pass filter widens small splats
 POSE_NOTE = "The model rests in another pose than the first frame; its skeleton was posed to compare both."
 
 
@@ -54,7 +58,8 @@ def run(job: Job) -> StepReport:
     posed = None
     if "subject" in job.inputs:
         subject = read_png(job.inputs["subject"])
-        placement = find_placement(cloud, subject, rasterize, azimuth, own.ups)
+        searched = merge_gaussians(cloud, SEARCHED) if surface is None else cloud
+        placement = find_placement(searched, subject, rasterize, azimuth, own.ups)
         if own.glb is not None and surface is not None:
             posed = posed_model(own.glb, surface, placement, subject, rasterize, settings, own.ups)
     else:
@@ -82,10 +87,11 @@ def run(job: Job) -> StepReport:
 
 def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[Tensor, "s s 4"]:
     """Render a placed model from azimuth 0 as a cut-out, straight alpha."""
+    camera = OrbitCamera(width=SUPERSAMPLE * size, height=SUPERSAMPLE * size)
     with torch.no_grad():
-        drawn = rasterize(cloud, [OrbitCamera(width=size, height=size)], torch.zeros(3))
-    straight = drawn.color[0] / drawn.alpha[0].clamp_min(1e-4)
-    return torch.cat([straight, drawn.alpha[0]], -1).clamp(0, 1)
+        drawn = rasterize(cloud, [camera], torch.zeros(3))
+    color, alpha = (resize(image, (size, size))[0] for image in (drawn.color, drawn.alpha))
+    return torch.cat([color / alpha.clamp_min(1e-4), alpha], -1).clamp(0, 1)
 
 
 def cover(glb: ForeignGlb, settings: AssetSettings, seed: int) -> SurfaceCloud:
@@ -140,7 +146,8 @@ def _notes(own: OwnModel, placement: Placement, job: Job) -> list[str]:
         model = own.glb.model
         kind = f"{len(model.parts)} mesh parts, {len(model.vertices)} vertices, {len(model.faces)} triangles"
     else:
-        kind = "splats"
+        assert own.splats is not None  # a model is a mesh or splats
+        kind = f"{len(own.splats)} splats"
     notes = [f"the shape is a model of the user's own ({kind})"]
     if "subject" in job.inputs:
         notes.append(

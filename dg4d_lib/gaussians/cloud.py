@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dg4d_lib.devices import to_device_async
@@ -72,6 +72,10 @@ class Gaussians:
             return self
         chosen = to_device_async(chosen, self.means.device)
         return replace(self, means=self.means[chosen], log_scales=self.log_scales[chosen], quats=self.quats[chosen])
+
+    def subset(self, rows: slice | Int[Tensor, " m"] | Bool[Tensor, " n"]) -> "Gaussians":
+        """Return some Gaussians of a cloud of one state."""
+        return Gaussians(**{name: value[rows] for name, value in vars(self).items()})
 
     def at(self, frame: int) -> "Gaussians":
         """Return one state of a batch."""

@@ -100,7 +100,7 @@ def densify(
 def prune(gaussians: Gaussians, min_opacity: float, max_scale: float) -> DensifyResult:
     """Remove Gaussians with a low opacity or a large scale."""
     source = ((gaussians.opacities >= min_opacity) & (gaussians.scales.amax(-1) <= max_scale)).nonzero()[:, 0]
-    kept = Gaussians(**{name: value[source] for name, value in vars(gaussians).items()})
+    kept = gaussians.subset(source)
     return DensifyResult(kept, source, torch.zeros_like(source, dtype=torch.bool))
 
 

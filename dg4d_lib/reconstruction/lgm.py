@@ -117,7 +117,7 @@ def reconstruct(
 def drop_faint(gaussians: Gaussians) -> Gaussians:
     """Remove Gaussians with an opacity below 0.005."""
     keep = gaussians.opacities >= MIN_OPACITY
-    return Gaussians(**{name: value[keep] for name, value in vars(gaussians).items()})
+    return gaussians.subset(keep)
 
 
 def load_lgm(path: Path, placement: Placement) -> Lgm:

@@ -8,7 +8,7 @@ import binascii
 import json
 import os.path
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from dg4d_lib.assets.formats.obj import read_obj
 from dg4d_lib.assets.formats.ply_mesh import declared_faces, read_ply_mesh
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.merging import merge_gaussians
 from steps.artifacts.archives import stays_inside, unpack
 from steps.sources.decode_limit import DecodeLimit
 
@@ -70,7 +71,8 @@ def read_model(path: Path, scratch: Path, settings: AssetSettings, max_decode_gb
         raise BadInput(f"the model must be one of {', '.join(FORMATS)}; given {', '.join(names[:5]) or 'nothing'}")
     file = scratch / main[0]
     with limit.enforced("the model"):
-        return _read(file, settings)
+        own = _read(file, settings)
+    return _merged(own, settings.max_splats)
 
 
 def _read(file: Path, settings: AssetSettings) -> OwnModel:
@@ -78,7 +80,7 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
         case ".ply":
             return _ply(file.read_bytes(), file.parent, settings)
         case ".spz":
-            splats, notes = read_spz(file.read_bytes(), settings.max_splats)
+            splats, notes = read_spz(file.read_bytes())
             return OwnModel(splats=splats, ups=("y", "-y"), notes=notes)
         case ".glb" | ".gltf":
             return _mesh(_whole_glb(file), settings)
@@ -90,6 +92,14 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             usd: Any = import_module("dg4d_lib.assets.formats.usd_model")  # the USD library starts slowly
             usd.check_usdz(file)
             return _mesh(write_model_glb(usd.read_usd(file, decode_picture, settings.max_faces)), settings)
+
+
+def _merged(own: OwnModel, most: int) -> OwnModel:
+    """Return the model with at most so many splats."""
+    if own.splats is None or len(own.splats) <= most:
+        return own
+    note = f"{len(own.splats)} splats were merged to {most}, which look alike (asset.max_splats)"
+    return replace(own, splats=merge_gaussians(own.splats, most), notes=(*own.notes, note))
 
 
 def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
@@ -112,7 +122,7 @@ def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
     if declared_faces(content):
         model = read_ply_mesh(content, lambda name: _beside(folder, name), decode_picture, settings.max_faces)
         return _mesh(write_model_glb(model), settings, ("y", "z"))
-    splats, notes = read_foreign_ply(content, settings.max_splats)
+    splats, notes = read_foreign_ply(content)
     return OwnModel(splats=splats, ups=("-y", "y", "z"), notes=notes)  # 3DGS has y down
 
 

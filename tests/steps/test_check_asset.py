@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -144,6 +145,28 @@ def test_a_mesh_that_was_filmed_is_seen_as_it_was_filmed() -> None:
     assert gates["silhouette"]["mesh"] == 1
     assert gates["flicker"]["mesh"] == pytest.approx(0, abs=1e-4)
     assert gates["motion"]["mesh"] == pytest.approx(1, abs=1e-4)
+
+
+def test_dense_small_splats_are_not_widened_by_the_size_of_the_renders() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = 0.3 * torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator), dim=1)
+    small = replace(
+        cloud().subset(torch.zeros(len(means), dtype=torch.long)),
+        means=means,
+        log_scales=torch.full((len(means), 3), math.log(0.002)),
+        opacity_logits=torch.full((len(means),), 4.0),
+    )
+    camera = OrbitCamera(width=256, height=256)
+    drawn = get_rasterizer("cpu")(small, [camera] * FRAMES, torch.zeros(3))
+    color = drawn.color / drawn.alpha.clamp_min(1e-4)
+    still = replace(small, **{n: getattr(small, n).expand(FRAMES, -1, -1) for n in ("means", "log_scales", "quats")})
+    asset = LoadedAsset(partial(states_between, still), tracked(), FRAMES)
+    found = collect_evidence(
+        asset, DrivingVideo(color, drawn.alpha, 24.0), torch.cat([color, drawn.alpha], -1)[0], get_rasterizer("cpu")
+    )
+    gates = {gate.name: gate.values for gate in evaluate_gates(found, GateSettings())}
+    assert gates["fidelity"]["splats"] > 40
+    assert gates["silhouette"]["splats"] > 0.99
 
 
 @pytest.mark.parametrize(

@@ -274,6 +274,27 @@ def test_splats_stay_splats(tmp_path: Path) -> None:
     torch.testing.assert_close(placed.scales, scale * cloud.scales)
 
 
+def test_more_splats_than_allowed_are_merged_and_all_move(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", cover_surface(fish(), 900, torch.Generator().manual_seed(0)).cloud)
+    path = zipped(tmp_path, model_ply=(tmp_path / "a.ply").read_bytes())
+    few = revise(SMALL, {"asset.max_splats": 500, "asset.fit_points": 200})
+    job = job_of("prepare_asset", tmp_path / "prepare", {"model": path}, few)
+    report = prepare_asset.run(job)
+    assert any("900 splats were merged to 500" in note for note in report.notes)
+    placed = read_ply(job.outputs["gaussians"])
+    assert len(placed) == 500
+    subject = read_png(job.outputs["subject"])
+    color, alpha = subject[..., :3], subject[..., 3:]
+    shifted = torch.stack([color, color.roll(3, 1)]), torch.stack([alpha, alpha.roll(3, 1)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(*shifted, 8.0))
+    inputs = {"gaussians": job.outputs["gaussians"], "driving_video": tmp_path / "video.zip"}
+    moved = job_of("animate_asset", tmp_path / "animate", inputs, few)
+    animate_asset.run(moved)
+    shift = read_motion(moved.outputs["motion"]).deformation.displace(placed.means, torch.tensor([1.0])).means[0]
+    assert shift.shape == (500, 3)
+    assert (shift[:, 0] > 0.02).all()
+
+
 REFUSED = {
     "no faces": ({"model_obj": b"v 0 0 0\nv 1 0 0\n"}, "no faces"),
     "nan": ({"model_obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"}, "not finite"),

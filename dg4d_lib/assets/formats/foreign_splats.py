@@ -22,12 +22,13 @@ from dg4d_lib.geometry.spherical_harmonics import C0
 
 SPZ_HEADER = 16  # bytes, of the versions 2 and 3
 HIGHEST_DEGREE = 4  # of color in an SPZ
+MOST = 4_000_000  # splats that are read
 CHUNK = 256  # splats of a compressed PLY that share bounds
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 HIGHER = "color of higher degrees was dropped: the splats keep their base color"
 
 
-def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[str, ...]]:
+def read_foreign_ply(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple[str, ...]]:
     """Read splats; return them with notes.
 
     Raises:
@@ -36,7 +37,7 @@ def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[
     beginning = content[:MAX_HEADER]
     header = beginning[: max(0, beginning.find(b"end_header"))]
     if b"\nelement chunk " in header:
-        return _read_compressed_ply(content, max_splats)
+        return _read_compressed_ply(content, most)
     if header and not {name.encode() for name in COLORS} <= set(header.split()):
         raise BadInput(
             "the PLY has no faces and no splat colors (f_dc_0, f_dc_1, f_dc_2), and points alone cannot be animated; "
@@ -46,7 +47,7 @@ def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[
     names = dtype.names or ()
     if missing := [name for name in (*MEANS, *OPACITY, *SCALES, *QUATS) if name not in names]:
         raise BadInput(f"the PLY holds no splats: it lacks {', '.join(missing)}; give splats, or a mesh with faces")
-    _check_count(count, max_splats)
+    _check_count(count, most)
     if len(content) < start + count * dtype.itemsize:
         raise BadInput("the PLY is truncated; export it again")
     rows = np.frombuffer(content, dtype, count, start)
@@ -58,7 +59,7 @@ def read_foreign_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[
     return _cloud(*map(columns, (MEANS, SCALES, QUATS, OPACITY, COLORS))), notes
 
 
-def read_spz(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[str, ...]]:
+def read_spz(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple[str, ...]]:
     """Read splats; return them with notes.
 
     Raises:
@@ -69,7 +70,7 @@ def read_spz(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[str, ...
             magic, version, count, degree, bits, _, streams = struct.unpack("<4sIIBBBB", stream.read(SPZ_HEADER))
             if magic != MAGIC or version not in (2, 3, 4) or degree > HIGHEST_DEGREE:
                 raise BadInput("the file is no SPZ of version 2, 3 or 4; export the splats as PLY")
-            _check_count(count, max_splats)
+            _check_count(count, most)
             sizes = (9, 1, 3, 3, 3 if version == 2 else 4)
             sections = (
                 _spz4_sections(content, streams, [size * count for size in sizes])
@@ -109,7 +110,7 @@ def _spz4_sections(content: bytes, streams: int, sizes: list[int]) -> list[bytes
     return sections
 
 
-def _read_compressed_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tuple[str, ...]]:
+def _read_compressed_ply(content: bytes, most: int) -> tuple[Gaussians, tuple[str, ...]]:
     """Read SuperSplat's compressed PLY: integers between the bounds of each 256 splats."""
     elements, start = parse_elements("the model", content[:MAX_HEADER])
     rows: dict[str, NDArray[Any]] = {}
@@ -122,7 +123,7 @@ def _read_compressed_ply(content: bytes, max_splats: int) -> tuple[Gaussians, tu
     bounds, splats = rows.get("chunk", nothing), rows.get("vertex", nothing)
     if not set(PACKED) <= set(splats.dtype.names or ()):
         raise BadInput(f"the compressed PLY lacks {', '.join(PACKED)}; export the splats as an uncompressed PLY")
-    _check_count(len(splats), max_splats)
+    _check_count(len(splats), most)
     chunk = np.arange(len(splats)) // CHUNK
     if chunk[-1] >= len(bounds):
         raise BadInput(f"the PLY has {len(bounds)} chunks of {CHUNK} for {len(splats)} splats; export it again")
@@ -163,14 +164,11 @@ def _logits(opacities: NDArray[np.floating]) -> NDArray[np.float64]:
     return logits
 
 
-def _check_count(count: int, max_splats: int) -> None:
+def _check_count(count: int, most: int) -> None:
     if count < 4:
         raise BadInput(f"the file holds {count} splats; at least 4 are needed")
-    if count > max_splats:
-        raise BadInput(
-            f"the file holds {count} splats; asset.max_splats allows {max_splats}: reduce them, or raise the limit "
-            f"with --set asset.max_splats={count}"
-        )
+    if count > most:
+        raise BadInput(f"the file holds {count} splats; at most {most} can be read: reduce them")
 
 
 def _cloud(

@@ -58,7 +58,7 @@ def test_nothing_moves_where_no_gaussian_does(gaussians: Gaussians, vertices: to
 
 
 def test_a_single_gaussian_carries_with_its_own_rotation(gaussians: Gaussians, vertices: torch.Tensor) -> None:
-    one = Gaussians(**{name: value[:1] for name, value in vars(gaussians).items()})
+    one = gaussians.subset(slice(1))
     quat = torch.tensor([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
     offsets = skin_vertices(vertices, one, turned(one, quat))
     torch.testing.assert_close(vertices + offsets[0], vertices @ quat_to_rotmat(quat).T, atol=1e-5, rtol=0)
@@ -111,7 +111,7 @@ def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: 
     generator = torch.Generator().manual_seed(5)
     displacement = replace(still(gaussians, 1), means=0.1 * torch.randn(1, 300, 3, generator=generator))
     order = torch.randperm(300, generator=generator)
-    other = Gaussians(**{name: value[order] for name, value in vars(gaussians).items()})
+    other = gaussians.subset(order)
     mixed = Displacement(**{name: value[:, order] for name, value in vars(displacement).items()})
     torch.testing.assert_close(
         skin_vertices(vertices, gaussians, displacement), skin_vertices(vertices, other, mixed), atol=1e-6, rtol=0
@@ -119,6 +119,6 @@ def test_order_of_the_gaussians_does_not_matter(gaussians: Gaussians, vertices: 
 
 
 def test_an_empty_cloud_is_refused(gaussians: Gaussians, vertices: torch.Tensor) -> None:
-    empty = Gaussians(**{name: value[:0] for name, value in vars(gaussians).items()})
+    empty = gaussians.subset(slice(0))
     with pytest.raises(BadInput, match="non-empty"):
         skin_vertices(vertices, empty, still(empty, 1))
