@@ -32,12 +32,13 @@ from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, rea
 from steps.runtime.job import Job, StepReport
 
 SIZE = 128  # pixels of a side of the renders; the bounds of the gates were calibrated at this size
-SUPERSAMPLE = 2  # of splats seen from the input view: the rasterizer's low-pass filter widens small ones by a pixel
+SUPERSAMPLE = 2  # of splats: at this size the rasterizer's low-pass filter widens small ones by a pixel
 MOST_FRAMES = 32  # frames of the video that are compared, evenly spaced
 TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
 TURN = 24  # renders of one turn
 COLUMNS = 4  # frames in the picture
+Draw = Callable[[Tensor, Sequence[OrbitCamera]], Tensor]  # renders of positions of the animation, a camera for each
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,6 @@ def collect_evidence(
     frames = _spread(len(video), MOST_FRAMES)
     positions = frames * asset.frames / len(video)
     front = OrbitCamera(width=SIZE, height=SIZE)
-    sharp = replace(front, width=SUPERSAMPLE * SIZE, height=SUPERSAMPLE * SIZE)
     timestamps = positions[_spread(len(frames), TIMESTAMPS).long()]
     sides = [OrbitCamera(elevation_deg, azimuth_deg, width=SIZE, height=SIZE) for elevation_deg, azimuth_deg in SIDES]
     ring = turntable(TURN, front)
@@ -126,9 +126,9 @@ def collect_evidence(
 
     seen, around = {}, {}
     for form, draw in ((SPLATS, splats), (MESH, triangles)):
-        drawn = _drawn(draw, positions, [sharp if form == SPLATS else front] * len(positions))
-        seen[form] = _pictures(resize(drawn[..., :4], (SIZE, SIZE)))
-        around[form] = _pictures(_drawn(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps)))
+        finer = SUPERSAMPLE if form == SPLATS else 1
+        seen[form] = _pictures(draw, positions, [front] * len(positions), finer)
+        around[form] = _pictures(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps), finer)
     turn = _drawn(splats, positions[:1].repeat(TURN), ring)
     flaws, folds = _worst_defects(asset, timestamps)
     return GateInputs(
@@ -169,14 +169,16 @@ def _spread(count: int, most: int) -> Float[Tensor, " n"]:
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
 
 
-def _drawn(
-    draw: Callable[[Tensor, Sequence[OrbitCamera]], Tensor], positions: Tensor, cameras: Sequence[OrbitCamera]
-) -> Float[Tensor, "b s s c"]:
+def _drawn(draw: Draw, positions: Tensor, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s c"]:
     parts = [slice(start, start + BATCH) for start in range(0, len(cameras), BATCH)]
     return torch.cat([draw(positions[part], cameras[part]) for part in parts])
 
 
-def _pictures(drawn: Float[Tensor, "b s s c"]) -> RgbaImages:
+def _pictures(draw: Draw, positions: Tensor, cameras: Sequence[OrbitCamera], finer: int) -> RgbaImages:
+    """Draw an asset so many times finer, and reduce the pictures to the size of the cameras."""
+    size = (cameras[0].height, cameras[0].width)
+    fine = [replace(camera, width=finer * camera.width, height=finer * camera.height) for camera in cameras]
+    drawn = resize(_drawn(draw, positions, fine)[..., :4], size)
     return RgbaImages(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
 
 

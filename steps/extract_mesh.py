@@ -41,6 +41,7 @@ from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
+from dg4d_lib.mesh.tracking.outline_detail import fit_outline_detail
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
 from dg4d_lib.mesh.tracking.separation import separate
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
@@ -159,6 +160,9 @@ def textured_mesh(
 ) -> TexturedMesh:
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
     vertices, faces = _isosurface(gaussians, level, rasterize, settings)
+    if frame is not None:
+        alpha = frame[1][None, ..., 0]
+        vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha)[0]
     shown = _shown(vertices, faces, frame)
     mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
@@ -214,6 +218,8 @@ def _tracked(
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
         relaxed = relax(vertices, registered, faces, silhouettes)
+        if video is not None:
+            relaxed = fit_outline_detail(vertices, relaxed, faces, video.alpha[..., 0])
         offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
         ious = silhouette_iou(vertices + offsets, faces, silhouettes)
         mesh, sources = coloring.result()
@@ -257,6 +263,7 @@ def _guided(
         vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )  # fmt: skip
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
+    refined = fit_outline_detail(vertices, refined, faces, video.alpha[..., 0])
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined, separated = _sound(vertices, refined, faces, silhouettes, video)
     moved = vertices + refined

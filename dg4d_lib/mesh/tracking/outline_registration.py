@@ -149,6 +149,7 @@ def outline_steps(
     faces: Int[Tensor, "f 3"],
     target: Float[np.ndarray, "p 4"],
     camera: OrbitCamera,
+    detail: float | None = None,
 ) -> tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, " v"]]:
     """Return steps of vertices along the outline of a mesh towards a target, parallel to the picture.
 
@@ -159,6 +160,8 @@ def outline_steps(
         faces: indices into the vertices.
         target: `points` of the target's outline.
         camera: camera of the picture.
+        detail: pixels; points step across the outline only, and those that are farther from the target do not count.
+            None: points step in any direction, all of them, by at most `LONGEST`.
 
     Returns:
         Mean step of every vertex, world units, and its share of outline points, which is 0 away from the outline.
@@ -170,12 +173,18 @@ def outline_steps(
     if len(target) == 0 or len(outline.points) == 0:
         return total, np.zeros(len(moved))
     steps = _closest_steps(outline.points, target)
-    steps *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9))
-    depth = fragments.depth[0].numpy()[outline.pixels]
+    if detail is not None:
+        normals = outline.points[:, 2:] / FACING
+        steps = (steps * normals).sum(1, keepdims=True) * normals
+    lengths = np.linalg.norm(steps, axis=1)
+    counted = np.flatnonzero(lengths <= (np.inf if detail is None else detail))
+    steps = (steps * np.minimum(1, LONGEST / np.maximum(lengths, 1e-9))[:, None])[counted]
+    rows, columns = (places[counted] for places in outline.pixels)
+    depth = fragments.depth[0].numpy()[rows, columns]
     axes = camera.viewmat().numpy()[:2, :3]  # right and down
     in_world = steps @ axes * (depth / camera.focal)[:, None]
-    weights = fragments.barycentrics[0].numpy()[outline.pixels].astype(np.float64)
-    corners = faces.numpy()[ids[outline.pixels]]
+    weights = fragments.barycentrics[0].numpy()[rows, columns].astype(np.float64)
+    corners = faces.numpy()[ids[rows, columns]]
     share = np.bincount(corners.ravel(), weights.ravel(), len(moved)).astype(np.float64)
     for axis in range(3):
         total[:, axis] = np.bincount(corners.ravel(), (weights * in_world[:, axis, None]).ravel(), len(moved))
