@@ -9,7 +9,7 @@ from flows.engine.frames import count_frames, divide_frames
 from flows.engine.requests import Conversion
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.flow_result import StepRun, notes_of
-from flows.step_calls import Asset, DrivingVideo, Gaussians, KnownViews, Mesh, Motion, Package, Subject, Verdict
+from flows.step_calls import Asset, DrivingVideo, Gaussians, KnownViews, Mesh, Motion, Package, Plan, Subject, Verdict
 from flows.step_errors import StepBadInput
 from steps.artifacts.mesh_plan import read_plan
 from steps.contract import ArtifactRef, StepResult
@@ -191,9 +191,12 @@ def mesh_over_time(
         guessed: subject whose shape the learned prior has guessed from its picture alone.
     """
     guide = driving_video if fitted else None
-    plan = tasks.plan_mesh(gaussians, motion, conversion, guide, subject=guessed)
-    if read_plan(home.store().path(plan.plan)).mode == "tracked":
-        return tasks.extract_mesh(gaussians, motion, plan, conversion, guide, subject=guessed)
+    planned = tasks.plan_mesh(gaussians, motion, conversion, guide, subject=guessed)
+    plan: Plan | Mesh = planned
+    if read_plan(home.store().path(planned.plan)).mode == "tracked":
+        plan = tasks.extract_mesh(gaussians, motion, planned, conversion, guide, subject=guessed)
+        if "plan" not in plan.outputs:
+            return plan
     frames = count_frames(driving_video.frames, home.store())
     parts = divide_frames(frames, conversion.mesh_parts or resources.cpus())
     extracted = [tasks.extract_mesh.submit(gaussians, motion, plan, conversion, guide, part) for part in parts]

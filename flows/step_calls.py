@@ -62,7 +62,7 @@ class Plan(StepResult):
 
 
 class Mesh(StepResult):
-    """Either one tracked mesh or a mesh per frame."""
+    """Either one tracked mesh or a mesh per frame; or the plan of the latter, where the former loses the video."""
 
 
 class Package(StepResult):
@@ -159,7 +159,7 @@ def plan_mesh(
 def extract_mesh(
     gaussians: Gaussians | Asset,
     motion: Motion,
-    plan: Plan,
+    plan: Plan | Mesh,
     conversion: Conversion,
     driving_video: DrivingVideo | None = None,
     part: Part | None = None,
@@ -168,7 +168,8 @@ def extract_mesh(
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames.
 
     Textures take their colors from the driving video, if it is given, where it shows the surface. With the subject, the
-    shape of one mesh is what the shape network says of it.
+    shape of one mesh is what the shape network says of it. A tracked mesh that loses the video may be given up for the
+    plan of a mesh per frame.
     """
     return run_step("extract_mesh", Mesh, **locals())
 

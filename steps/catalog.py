@@ -205,7 +205,7 @@ STEPS: dict[str, StepSpec] = {
                 "subject": _optional(PNG),
                 "depth_field": _optional(DEPTH_FIELD),
             },
-            outputs={**EITHER_MESH, "picture": PNG},
+            outputs={**EITHER_MESH, "plan": _optional(PLAN), "picture": PNG},
             settings="steps.profiles:FrameRange",
             sections=("rasterizer", "subject.turn_deg", "mesh"),
         ),

@@ -50,7 +50,7 @@ from dg4d_lib.settings import MeshSettings
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames, write_png
-from steps.artifacts.mesh_plan import MeshPlan, read_plan
+from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
 from steps.fitting.guesses import guessed_shapes
@@ -64,6 +64,8 @@ Surface = tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
 SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squared error
 FITTED, FITTED_SELECTIVITY = 32, 1  # frames that the texture is then fitted to, and the exponent of their weights
+LOST_DB, LOST_SHARE = 8.0, 1 / 8  # of PSNR by which a frame is lost, and the largest share of such frames
+CLOSE_ERROR = 1e-3  # squared error below which Gaussians are not closer to the video, 30 dB
 LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
@@ -103,6 +105,8 @@ class Candidate(NamedTuple):
 def run(job: Job) -> StepReport:
     """Extract the tracked mesh, or the meshes of frames `first_frame` to `end_frame`, as the plan says.
 
+    In mode `auto`, a tracked mesh that loses the video is not written, but the plan of a mesh per frame is.
+
     Raises:
         BadInput: the motion does not have these frames.
     """
@@ -128,8 +132,13 @@ def run(job: Job) -> StepReport:
             rest = rest_shape(plan.reference_frame)
             tracked, ious, notes = _tracked(rest, states, displacement, plan, rasterize, settings, video)
         job.progress(stages - 1, stages, {})
-        write_tracked(job.outputs["tracked"], tracked)
         mesh = tracked.mesh
+        lost = _lost_frames(tracked, states, video, rasterize) if video and settings.mode == "auto" else 0
+        if lost > LOST_SHARE * frames:
+            write_plan(job.outputs["plan"], MeshPlan(mode="per_frame", level=plan.level, grid=plan.grid))
+            note = f"one mesh loses {lost} of {frames} frames (the Gaussians are {LOST_DB:g} dB closer to the video)"
+            return _report(job, mesh, weights, [*notes, f"{note}: every frame gets its own"])
+        write_tracked(job.outputs["tracked"], tracked)
         kind = "isosurface of the Gaussians" if guesses is None else "shape network's surface"
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
@@ -151,6 +160,11 @@ def run(job: Job) -> StepReport:
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
         mesh = meshes[first]
+    return _report(job, mesh, weights, notes)
+
+
+def _report(job: Job, mesh: TexturedMesh, weights: dict[str, str], notes: list[str]) -> StepReport:
+    """Write the picture of a mesh; return the report of the step."""
     write_png(job.outputs["picture"], _picture(mesh))
     return StepReport(f"{job.settings.rasterizer} rasterizer, pymeshlab", weights, notes=tuple(notes))
 
@@ -346,6 +360,20 @@ def _squared_errors(mesh: TexturedMesh, surfaces: list[PosedSurface]) -> list[fl
         rendered = color_over_white(*render_mesh(replace(mesh, vertices=surface.vertices), [camera]))[0]
         errors.append(float((rendered - color_over_white(surface.color, surface.alpha)).square().mean()))
     return errors
+
+
+def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, rasterize: Rasterizer) -> int:
+    """Count the frames that the Gaussians show closer by `LOST_DB` or more than the mesh does, at the input view."""
+    size = video.frames.shape[1]
+    camera, white, lost = OrbitCamera(width=size, height=size), torch.ones(3), 0
+    moved = tracked.mesh.vertices + tracked.offsets
+    for frame, (color, alpha) in enumerate(zip(video.frames, video.alpha, strict=True)):
+        (error,) = _squared_errors(tracked.mesh, [PosedSurface(moved[frame], moved[frame], color, alpha)])
+        with torch.no_grad():
+            drawn = rasterize(states.at(frame), [camera], white).color[0]
+        best = max(float((drawn - color_over_white(color, alpha)).square().mean()), CLOSE_ERROR)
+        lost += error > best * 10 ** (LOST_DB / 10)
+    return lost
 
 
 def _at(video: DrivingVideo | None, frame: int) -> Frame | None:

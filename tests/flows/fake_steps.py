@@ -168,6 +168,8 @@ def extract_mesh(job: Job) -> StepReport:
         with zipfile.ZipFile(job.outputs["meshes"], "w") as archive:
             for i in range(settings.first_frame, settings.end_frame):
                 add_entry(archive, f"{i:03d}.safetensors", f"frame {i}".encode())
+    elif b"stumbles" in words and settings.mesh.mode == "auto":
+        write_plan(job.outputs["plan"], MeshPlan(mode="per_frame", level=0.5))
     else:
         job.outputs["tracked"].write_bytes(words)
     job.outputs["picture"].write_bytes(PNG)

@@ -120,6 +120,16 @@ def test_a_mesh_per_frame_is_divided_and_joined(alone: Path, tmp_path: Path, mon
     assert (tmp_path / "one" / "asset.glb").read_bytes() == (tmp_path / "out" / "asset.glb").read_bytes()
 
 
+@pytest.mark.parametrize(("mode", "extracted", "joined"), [("auto", 3, 1), ("tracked", 1, 0)])
+def test_one_mesh_that_loses_the_video_gives_way_to_a_mesh_per_frame(
+    alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, extracted: int, joined: int
+) -> None:
+    monkeypatch.setenv("DG4D_CPUS", "2")
+    convert_inline(job("stumbles", tmp_path, **{"mesh.mode": mode}), tmp_path / "out")
+    steps = ran(alone)
+    assert (steps.count("extract_mesh"), steps.count("join_meshes")) == (extracted, joined)
+
+
 @pytest.mark.parametrize(("kind", "guessed"), [("learned", True), ("geometric", False)])
 def test_one_mesh_has_the_shape_that_the_learned_prior_guessed(
     alone: Path, tmp_path: Path, kind: str, guessed: bool

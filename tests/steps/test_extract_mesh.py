@@ -234,6 +234,31 @@ def test_of_two_frames_the_one_whose_mesh_shows_the_video_stays(
     assert worse < better - 3
 
 
+@pytest.mark.parametrize(
+    ("mode", "moves", "given_up"), [("auto", False, True), ("auto", True, False), ("tracked", False, False)]
+)
+def test_one_mesh_that_shows_the_video_far_worse_than_the_gaussians_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, moves: bool, given_up: bool
+) -> None:
+    """The mesh stands still in a corner of the picture, or goes with the ball."""
+
+    def stand(vertices: torch.Tensor, offsets: torch.Tensor, *_: object) -> torch.Tensor:
+        away = torch.tensor([0.0, 0.5, 0.0]).expand_as(offsets)
+        return offsets if moves else away
+
+    monkeypatch.setattr(plan_mesh, "select_reference_frame", lambda *given: Trial(1, 0.9, 0.0))
+    monkeypatch.setattr(extract_mesh, "fit_outline_detail", stand)
+    steps = (torch.arange(FRAMES) + 1)[:, None, None] * SHIFT
+    states = replace(ball(), means=ball().means + steps, log_scales=ball().log_scales.expand(FRAMES, -1, -1),
+                     quats=ball().quats.expand(FRAMES, -1, -1))  # fmt: skip
+    drawn = get_rasterizer("cpu")(states, [CAMERA] * FRAMES, torch.zeros(3))
+    write_frames(tmp_path / "video", DrivingVideo(drawn.color / drawn.alpha.clamp_min(1e-4), drawn.alpha, 8.0))
+    _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": mode}), tmp_path / "video")
+    assert (tmp_path / "tracked").exists() is not given_up
+    assert read_plan(tmp_path / "plan").mode == ("per_frame" if given_up else "tracked")
+    assert any("every frame gets its own" in note for note in facts.notes) is given_up
+
+
 @pytest.mark.parametrize("source", ["prior", "gaussians"])
 def test_a_guessed_subject_has_the_surface_of_the_shape_network(tmp_path: Path, source: str) -> None:
     alpha = green_video(tmp_path / "video")

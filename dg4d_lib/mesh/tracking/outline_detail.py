@@ -20,7 +20,7 @@ from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh.tracking.outline_registration import outline_of, outline_steps
 
 SIZE = 1024  # pixels of the compared outlines
-ROUNDS = 4
+ROUNDS = 3
 LONGEST = 8.0  # pixels of a step; what is farther off is no detail
 PULL = 10.0  # weight of the step of a vertex on the outline, against 1 for the difference along each of its edges
 STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 3 edges

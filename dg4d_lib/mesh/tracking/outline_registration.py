@@ -63,13 +63,24 @@ class Outline:
 
 def outline_of(mask: Bool[np.ndarray, "h w"]) -> Outline:
     """Return the border pixels of a mask with outward normals."""
-    rows, columns = np.nonzero(mask & ~ndimage.binary_erosion(mask))
-    blurred = ndimage.gaussian_filter(mask.astype(np.float64), BLUR)
+    top, left, cropped = _cropped(mask, round(6 * BLUR))
+    rows, columns = np.nonzero(cropped & ~ndimage.binary_erosion(cropped))
+    blurred = ndimage.gaussian_filter(cropped.astype(np.float64), BLUR)
     down, right = (np.asarray(np.gradient(blurred, axis=axis)) for axis in (0, 1))
     normals = -np.stack([right[rows, columns], down[rows, columns]], 1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    rows, columns = rows + top, columns + left
     points = np.concatenate([np.stack([columns, rows], 1) + 0.5, FACING * normals], 1)
     return Outline(points.astype(np.float64), (rows, columns))
+
+
+def _cropped(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[int, int, Bool[np.ndarray, "i j"]]:
+    """Return first row, first column and content of the part of a mask that is not empty, with a margin."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    if len(rows) == 0:
+        return 0, 0, mask[:2, :2]
+    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
+    return top, left, mask[top : rows[-1] + margin + 1, left : columns[-1] + margin + 1]
 
 
 def register_to_outlines(
