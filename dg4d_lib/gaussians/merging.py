@@ -21,8 +21,8 @@ COLOR = 0.1  # difference in color, in [0, 1], that counts as much as `DISTANCE`
 DISTANCE = 1 / 60  # of the cloud's radius
 KNUD_THOMSEN = 1.6075  # exponent in the approximate surface area of ellipsoids
 HIGHEST_OPACITY = 0.995
+PAIRS = 0.4  # in a round, for each Gaussian, at most; the last ones would be of different colors
 LARGEST_SCALE = 40.0  # logarithm of the model's units; files of strangers hold any number
-SHARE = 4  # one pair for so many Gaussians and round: a merged one may be merged again
 
 
 def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
@@ -30,7 +30,7 @@ def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
 
     In each round, pairs of neighbors are merged in the order of what merging them costs: the loss of variance of
     positions and colors, weighted by opacity and area. A pair becomes a Gaussian with its mean, covariance and color,
-    whose opacity keeps the sum of opacity times area.
+    whose opacity keeps the sum of opacity times area, less what both cover already.
 
     Args:
         cloud: one state, with view-independent colors.
@@ -71,17 +71,16 @@ def _cheapest_pairs(cloud: Gaussians, radius: float, most: int) -> tuple[Int[Ten
     points = cloud.means.numpy()
     count = len(points)
     near = cKDTree(points).query(points, k=min(NEIGHBORS, count - 1) + 1, workers=-1)[1]
-    first, second = np.repeat(np.arange(count), near.shape[1]), near.ravel()
-    apart = first != second
-    pairs = np.unique(np.sort(np.stack([first[apart], second[apart]], 1), axis=1), axis=0)
-    first, second = pairs.T
+    rows, near = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    keys = np.unique((np.minimum(rows, near) * count + np.maximum(rows, near))[rows != near])
+    first, second = np.divmod(keys, count)
     masses = _masses(cloud).numpy()
     spread = masses[first] * masses[second] / (masses[first] + masses[second])
     colors = cloud.colors.numpy()
     distance = np.square(points[first] - points[second]).sum(1) / (DISTANCE * radius) ** 2
     difference = np.square(colors[first] - colors[second]).sum(1) / COLOR**2
     order = np.argsort(spread * (distance + difference), kind="stable")
-    chosen = order[_disjoint(first[order], second[order], count, min(most, max(1, count // SHARE)))]
+    chosen = order[_disjoint(first[order], second[order], count, min(most, math.ceil(PAIRS * count)))]
     return torch.from_numpy(first[chosen]), torch.from_numpy(second[chosen])
 
 
