@@ -310,11 +310,17 @@ def _sound(
     silhouettes: Bool[Tensor, "t k h w"],
     video: DrivingVideo | None,
 ) -> tuple[Float[Tensor, "t v 3"], list[str]]:
-    """Return offsets with fewer crossings and flipped faces, and a note if there were crossings."""
+    """Return offsets with fewer crossings and flipped faces, and a note if there were crossings.
+
+    Faces may not be flipped against the reference frame, nor against the first frame, which is the base of the morph
+    targets.
+    """
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
     places = f"parts that had sunk into each other in {frames} of {len(offsets)} frames"
     notes = [f"{places} were moved apart, as far as outlines allow"] if frames else []
-    return turn_back(vertices, separated, faces, silhouettes), notes
+    turned = turn_back(vertices, separated, faces, silhouettes)
+    first = turned[0]
+    return turn_back(vertices + first, turned - first, faces, silhouettes) + first, notes
 
 
 def _fitted(

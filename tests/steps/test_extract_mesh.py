@@ -2,8 +2,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,6 +17,7 @@ from dg4d_lib.fitting import guided_mesh
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.tracking.reference_frame import Trial
 from dg4d_lib.metrics.image import iou
@@ -257,6 +260,24 @@ def test_one_mesh_that_shows_the_video_far_worse_than_the_gaussians_is_given_up(
     assert (tmp_path / "tracked").exists() is not given_up
     assert read_plan(tmp_path / "plan").mode == ("per_frame" if given_up else "tracked")
     assert any("every frame gets its own" in note for note in facts.notes) is given_up
+
+
+def test_no_face_is_flipped_against_the_first_frame() -> None:
+    """A third of the vertices stand out in the first frame and are pressed in later; each way tilts faces a little."""
+    solid = trimesh.creation.icosphere(3, 0.4)
+    vertices, faces = torch.from_numpy(solid.vertices).float(), torch.from_numpy(np.asarray(solid.faces))
+    picked = torch.from_numpy(np.random.default_rng(0).random(len(vertices)) < 0.35)[:, None]
+    offsets = torch.stack([0.08 * picked * vertices, -0.08 * picked * vertices])
+    silhouettes = torch.ones(2, 1, 128, 128, dtype=torch.bool)
+
+    def flipped(against: torch.Tensor, offsets: torch.Tensor) -> int:
+        finder = DefectFinder(faces.numpy(), against.double().numpy())
+        return sum(int(finder.flipped((vertices + one).double().numpy()).sum()) for one in offsets)
+
+    assert flipped(vertices, offsets) == 0
+    assert flipped(vertices + offsets[0], offsets) > 0
+    sound, _ = extract_mesh._sound(vertices, offsets, faces, silhouettes, None)
+    assert flipped(vertices, sound) == flipped(vertices + sound[0], sound) == 0
 
 
 @pytest.mark.parametrize("source", ["prior", "gaussians"])
