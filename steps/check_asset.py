@@ -38,7 +38,7 @@ TIMESTAMPS = 4  # number of frames that are rendered from other sides
 SIDES = ((0.0, 45.0), (10.0, 90.0), (0.0, 180.0), (10.0, 270.0))  # elevation and azimuth, degrees
 TURN = 24  # renders of one turn
 COLUMNS = 4  # frames in the picture
-Draw = Callable[[Tensor, Sequence[OrbitCamera]], Tensor]  # renders of positions of the animation, a camera for each
+DrawAt = Callable[[Tensor, Sequence[OrbitCamera]], Tensor]  # renders of positions of the animation, a camera for each
 
 
 @dataclass(frozen=True)
@@ -169,12 +169,12 @@ def _spread(count: int, most: int) -> Float[Tensor, " n"]:
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
 
 
-def _drawn(draw: Draw, positions: Tensor, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s c"]:
+def _drawn(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s c"]:
     parts = [slice(start, start + BATCH) for start in range(0, len(cameras), BATCH)]
     return torch.cat([draw(positions[part], cameras[part]) for part in parts])
 
 
-def _pictures(draw: Draw, positions: Tensor, cameras: Sequence[OrbitCamera], finer: int) -> RgbaImages:
+def _pictures(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera], finer: int) -> RgbaImages:
     """Draw an asset so many times finer, and reduce the pictures to the size of the cameras."""
     size = (cameras[0].height, cameras[0].width)
     fine = [replace(camera, width=finer * camera.width, height=finer * camera.height) for camera in cameras]

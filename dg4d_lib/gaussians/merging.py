@@ -22,7 +22,8 @@ DISTANCE = 1 / 60  # of the cloud's radius
 KNUD_THOMSEN = 1.6075  # exponent in the approximate surface area of ellipsoids
 HIGHEST_OPACITY = 0.995
 PAIRS = 0.4  # in a round, for each Gaussian, at most; the last ones would be of different colors
-LARGEST_SCALE = 40.0  # logarithm of the model's units; files of strangers hold any number
+LARGEST_SCALE, LARGEST_LOGIT = 40.0, 20.0  # logarithm of the model's units, and logit: files hold any number
+JITTER = 1e-10  # of the largest coordinate, or of 1: many Gaussians at one place would all have the same neighbors
 
 
 def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
@@ -42,7 +43,11 @@ def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
     if len(visible) < most:  # a cloud that is hardly there keeps its most visible ones
         visible = cloud.opacities.topk(most).indices.sort().values
     given, cloud = cloud.means.dtype, cloud.subset(visible).to(torch.float64)
-    cloud = replace(cloud, log_scales=cloud.log_scales.clamp(-LARGEST_SCALE, LARGEST_SCALE))
+    cloud = replace(
+        cloud,
+        log_scales=cloud.log_scales.clamp(-LARGEST_SCALE, LARGEST_SCALE),
+        opacity_logits=cloud.opacity_logits.clamp(min=-LARGEST_LOGIT),
+    )
     center = cloud.means.median(0).values
     radius = float((cloud.means - center).norm(dim=1).median().clamp_min(1e-12))
     while (excess := len(cloud) - most) > 0:
@@ -70,7 +75,8 @@ def _cheapest_pairs(cloud: Gaussians, radius: float, most: int) -> tuple[Int[Ten
     """Return disjoint pairs of neighbors, the cheapest ones, at most `most`."""
     points = cloud.means.numpy()
     count = len(points)
-    near = cKDTree(points).query(points, k=min(NEIGHBORS, count - 1) + 1, workers=-1)[1]
+    jitter = JITTER * max(np.abs(points).max(), 1.0) * np.random.default_rng(0).standard_normal(points.shape)
+    near = cKDTree(points + jitter).query(points + jitter, k=min(NEIGHBORS, count - 1) + 1, workers=-1)[1]
     rows, near = np.repeat(np.arange(count), near.shape[1]), near.ravel()
     keys = np.unique((np.minimum(rows, near) * count + np.maximum(rows, near))[rows != near])
     first, second = np.divmod(keys, count)

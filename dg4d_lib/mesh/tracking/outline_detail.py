@@ -23,7 +23,7 @@ SIZE = 1024  # pixels of the compared outlines
 ROUNDS = 3
 LONGEST = 8.0  # pixels of a step; what is farther off is no detail
 PULL = 10.0  # weight of the step of a vertex on the outline, against 1 for the difference along each of its edges
-STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 3 edges
+STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 4 edges
 ATTEMPTS = 4  # at frames without new defects; around them, the vertices go back
 
 
@@ -44,12 +44,12 @@ def fit_outline_detail(
         alpha: of the video, at the input view.
     """
     camera = OrbitCamera(width=SIZE, height=SIZE)
-    masks = functional.interpolate(alpha[:, None], (SIZE, SIZE), mode="bicubic")[:, 0] > ALPHA_THRESHOLD
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
     fitted = offsets.clone()
 
     def fit_frame(frame: int) -> None:
-        target = outline_of(masks[frame].numpy(force=True)).points
+        enlarged = functional.interpolate(alpha[frame, None, None], (SIZE, SIZE), mode="bicubic")[0, 0]
+        target = outline_of((enlarged > ALPHA_THRESHOLD).numpy(force=True)).points
         start = (vertices + offsets[frame]).double().numpy()
         moved = start
         for _ in range(ROUNDS):

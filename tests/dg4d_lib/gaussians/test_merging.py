@@ -91,12 +91,14 @@ def test_clouds_that_are_small_enough_stay() -> None:
     "cloud",
     [
         replace(card(), means=torch.zeros(SIDE**2, 3)),
+        replace(card(), means=torch.ones(SIDE**2, 3)),
         replace(card(), log_scales=torch.full((SIDE**2, 3), 300.0)),
         replace(card(), log_scales=torch.full((SIDE**2, 3), -300.0)),
         replace(card(), means=1e30 * card().means),
         card(1e-6),
+        replace(card(), opacity_logits=torch.full((SIDE**2,), -1000.0)),
     ],
-    ids=["one place", "huge", "tiny", "far apart", "invisible"],
+    ids=["origin", "one place", "huge", "tiny", "far apart", "faint", "invisible"],
 )
 def test_degenerate_clouds_are_merged(cloud: Gaussians) -> None:
     merged = merge_gaussians(cloud, 7)
