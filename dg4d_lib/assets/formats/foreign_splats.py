@@ -22,7 +22,7 @@ from dg4d_lib.geometry.spherical_harmonics import C0
 
 SPZ_HEADER = 16  # bytes, of the versions 2 and 3
 HIGHEST_DEGREE = 4  # of color in an SPZ
-MOST = 4_000_000  # splats that are read
+MOST = 2_000_000  # splats that are read
 CHUNK = 256  # splats of a compressed PLY that share bounds
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 HIGHER = "color of higher degrees was dropped: the splats keep their base color"
