@@ -24,7 +24,7 @@ ROUNDS = 3
 LONGEST = 8.0  # pixels of a step; what is farther off is no detail
 PULL = 10.0  # weight of the step of a vertex on the outline, against 1 for the difference along each of its edges
 STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 4 edges
-ATTEMPTS = 4  # at frames without new defects; around them, the vertices go back
+ATTEMPTS, WIDER = 20, 3  # at frames without new defects, and those after which more vertices around them go back
 
 
 def fit_outline_detail(
@@ -65,13 +65,14 @@ def fit_outline_detail(
 def _without_new_defects(
     body: ElasticBody, start: Float64[np.ndarray, "v 3"], moved: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, "v 3"]:
-    """Return the moved vertices, but those near new defects where they started; all of these if defects are left."""
+    """Return the moved vertices, but those near defects where they started, if there are new ones; all in the end."""
     before = body.defective(start)
     back = np.zeros(len(start), bool)
-    for _ in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS):
         kept = np.where(back[:, None], start, moved)
-        new = body.defective(kept) & ~before
-        if not new.any():
+        defective = body.defective(kept)
+        if not (defective & ~before).any():
             return kept
-        back |= grown(faces_to_vertices(new, body.faces, len(start)) | back, body.edges, 1)
+        # around old ones, too: a new one may cross a face that crossed others before
+        back |= grown(faces_to_vertices(defective, body.faces, len(start)), body.edges, 1 + attempt // WIDER)
     return start
