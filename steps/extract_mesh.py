@@ -360,12 +360,15 @@ def _footage(
 
 def _squared_errors(mesh: TexturedMesh, surfaces: list[PosedSurface]) -> list[float]:
     """Return the mean squared errors of renders from the input camera against frames of the video, over white."""
-    errors = []
-    for surface in surfaces:
-        camera = OrbitCamera(width=surface.color.shape[1], height=surface.color.shape[0])
-        rendered = color_over_white(*render_mesh(replace(mesh, vertices=surface.vertices), [camera]))[0]
-        errors.append(float((rendered - color_over_white(surface.color, surface.alpha)).square().mean()))
-    return errors
+    return [_squared_error(mesh, surface.vertices, (surface.color, surface.alpha)) for surface in surfaces]
+
+
+def _squared_error(mesh: TexturedMesh, vertices: Float[Tensor, "v 3"], frame: Frame) -> float:
+    """Return the mean squared error of the mesh with these vertices against a frame of the video, over white."""
+    expected = color_over_white(*frame)
+    camera = OrbitCamera(width=expected.shape[1], height=expected.shape[0])
+    rendered = color_over_white(*render_mesh(replace(mesh, vertices=vertices), [camera]))[0]
+    return float((rendered - expected).square().mean())
 
 
 def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, rasterize: Rasterizer) -> int:
@@ -373,12 +376,11 @@ def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, r
     size = video.frames.shape[1]
     camera, white, lost = OrbitCamera(width=size, height=size), torch.ones(3), 0
     moved = tracked.mesh.vertices + tracked.offsets
-    for frame, (color, alpha) in enumerate(zip(video.frames, video.alpha, strict=True)):
-        (error,) = _squared_errors(tracked.mesh, [PosedSurface(moved[frame], moved[frame], color, alpha)])
+    for frame, shown in enumerate(zip(video.frames, video.alpha, strict=True)):
         with torch.no_grad():
             drawn = rasterize(states.at(frame), [camera], white).color[0]
-        best = max(float((drawn - color_over_white(color, alpha)).square().mean()), CLOSE_ERROR)
-        lost += error > best * 10 ** (LOST_DB / 10)
+        best = max(float((drawn - color_over_white(*shown)).square().mean()), CLOSE_ERROR)
+        lost += _squared_error(tracked.mesh, moved[frame], shown) > best * 10 ** (LOST_DB / 10)
     return lost
 
 

@@ -10,7 +10,7 @@ from steps.contract import Frozen
 
 
 class MeshPlan(Frozen):
-    """Decisions that `plan_mesh` makes and `extract_mesh` carries out."""
+    """Decisions that `plan_mesh` makes, or `extract_mesh` that gives one mesh up, and `extract_mesh` carries out."""
 
     mode: Literal["tracked", "per_frame"]
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")

@@ -10,14 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import run_parallel
-from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh.neighbors import faces_to_vertices, grown, screened_factors
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
-from dg4d_lib.mesh.tracking.outline_registration import outline_of, outline_steps
+from dg4d_lib.mesh.tracking.outline_registration import enlarged_masks, outline_of, outline_steps
 
 SIZE = 1024  # pixels of the compared outlines
 ROUNDS = 3
@@ -48,8 +46,7 @@ def fit_outline_detail(
     fitted = offsets.clone()
 
     def fit_frame(frame: int) -> None:
-        enlarged = functional.interpolate(alpha[frame, None, None], (SIZE, SIZE), mode="bicubic")[0, 0]
-        target = outline_of((enlarged > ALPHA_THRESHOLD).numpy(force=True)).points
+        target = outline_of(enlarged_masks(alpha[frame, None], SIZE)[0].numpy(force=True)).points
         start = (vertices + offsets[frame]).double().numpy()
         moved = start
         for _ in range(ROUNDS):
@@ -65,7 +62,7 @@ def fit_outline_detail(
 def _without_new_defects(
     body: ElasticBody, start: Float64[np.ndarray, "v 3"], moved: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, "v 3"]:
-    """Return the moved vertices, but those near defects where they started, if there are new ones; all in the end."""
+    """Return the moved vertices; near defects they go back, ring by ring, until no defect is new."""
     before = body.defective(start)
     back = np.zeros(len(start), bool)
     for attempt in range(ATTEMPTS):

@@ -74,6 +74,11 @@ def outline_of(mask: Bool[np.ndarray, "h w"]) -> Outline:
     return Outline(points.astype(np.float64), (rows, columns))
 
 
+def enlarged_masks(alpha: Float[Tensor, "t h w"], size: int) -> Bool[Tensor, "t s s"]:
+    """Return the masks of a subject at another size, pixels."""
+    return functional.interpolate(alpha[:, None], (size, size), mode="bicubic")[:, 0] > ALPHA_THRESHOLD
+
+
 def _cropped(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[int, int, Bool[np.ndarray, "i j"]]:
     """Return first row, first column and content of the part of a mask that is not empty, with a margin."""
     rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
@@ -114,7 +119,7 @@ def register_to_outlines(
         loop: the two orders are the halves of a loop, and go on into each other as far as that is better.
     """
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in AZIMUTHS_DEG]
-    masks = [functional.interpolate(alpha[:, None], (SIZE, SIZE), mode="bicubic")[:, 0] > ALPHA_THRESHOLD]
+    masks = [enlarged_masks(alpha, SIZE)]
     black = torch.zeros(3, device=states.means.device)
     for camera in cameras[1:]:
         with torch.no_grad():
