@@ -407,7 +407,7 @@ def _isosurface(gaussians: Gaussians, level: float, rasterize: Rasterizer, setti
 
 
 def _faired(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], settings: MeshSettings) -> Surface:
-    vertices = unfold(fair(vertices, faces, settings.fairing), faces)
+    vertices = unfold(fair(unfold(vertices, faces), faces, settings.fairing), faces)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 

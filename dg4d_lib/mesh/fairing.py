@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.mesh.extraction.unfold import without_new_defects
+from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, graph_laplacian, mesh_edges, neighbor_means, screened_factors
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -88,6 +90,8 @@ def fair(
 ) -> Float[np.ndarray, "v 3"]:
     """Return vertices without bumps; on the outline of the input view they move in depth alone.
 
+    Where that would fold thin parts, they move less.
+
     Args:
         vertices: of a surface of nearly equal edges, world units.
         faces: counter-clockwise seen from outside.
@@ -100,7 +104,8 @@ def fair(
     held = LowPass(edges, strength, 1 + HOLD * outline_shares(vertices, faces, INPUT_CAMERA))
     free = LowPass(edges, strength)
     columns = zip((held, held, free), vertices.T, strict=True)  # x and y are parallel to the picture of the input view
-    return np.stack([smooth(column) for smooth, column in columns], 1).astype(vertices.dtype)
+    smooth = np.stack([filtered(column) for filtered, column in columns], 1)
+    return without_new_defects(vertices, smooth, faces, edges, DefectFinder(faces).defective).astype(vertices.dtype)
 
 
 def outline_shares(

@@ -9,8 +9,8 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
-from scipy.sparse import csr_array
 
+from dg4d_lib.geometry.rotation import nearest_rotation
 from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.topology import face_components
 from dg4d_lib.mesh.neighbors import half_edges, mesh_edges
@@ -56,10 +56,7 @@ class DefectFinder:
         self._faces, self._rest = faces, rest
         self._first, self._second, _ = neighboring_faces(faces)
         if rest is not None:
-            self._sides = half_edges(faces)
-            self._arms = _arms(rest, self._sides)
             self._normals_at_rest = unit_normals(rest, faces)
-            self._at_vertices = _sums_at_vertices(self._sides, len(rest))
 
     def defective(
         self, vertices: Float[np.ndarray, "v 3"], moved: Bool[np.ndarray, " v"] | None = None
@@ -104,12 +101,10 @@ class DefectFinder:
         """
         if self._rest is None:
             return np.zeros(len(self._faces), np.bool_)
-        products = _arms(vertices, self._sides)[:, :, None] * self._arms[:, None, :]
-        at_vertex = (self._at_vertices @ products.reshape(-1, 9)).reshape(-1, 3, 3)
-        u, _, vt = np.linalg.svd(at_vertex[self._faces].sum(1))
-        u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
-        expected = np.einsum("fij,fj->fi", u @ vt, self._normals_at_rest)
-        return np.einsum("fi,fi->f", expected, normals) < 0
+        marked = np.zeros(len(self._faces), np.bool_)
+        poses = (np.asarray(pose, np.float64) for pose in (vertices, self._rest))
+        _mark_flipped(*poses, self._faces, normals, self._normals_at_rest, marked)
+        return marked
 
 
 def surface_defects(
@@ -186,15 +181,27 @@ def self_intersecting(
     return marked
 
 
-def _arms(vertices: Float[np.ndarray, "v 3"], sides: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "e 3"]:
-    ends = np.asarray(vertices, np.float64)[sides]
-    return ends[:, 1] - ends[:, 0]
-
-
-def _sums_at_vertices(sides: Int[np.ndarray, "e 2"], count: int) -> csr_array:
-    """Return the matrix that sums the values of half edges at both of their ends."""
-    places = (sides.ravel(), np.repeat(np.arange(len(sides)), 2))
-    return csr_array((np.ones(sides.size), places), shape=(count, len(sides)))
+@njit(cache=True, nogil=True)
+@no_type_check
+def _mark_flipped(vertices, rest, faces, normals, normals_at_rest, marked):
+    """Mark the faces whose normals point against those at rest, turned with their neighborhood."""
+    at_vertex = np.zeros((len(vertices), 3, 3))
+    for face in faces:
+        for k in range(3):
+            i, j = face[k], face[(k + 1) % 3]
+            for a in range(3):
+                for b in range(3):
+                    product = (vertices[j, a] - vertices[i, a]) * (rest[j, b] - rest[i, b])
+                    at_vertex[i, a, b] += product
+                    at_vertex[j, a, b] += product
+    rotation = np.empty((3, 3))
+    for f in range(len(faces)):
+        nearest_rotation(at_vertex[faces[f, 0]] + at_vertex[faces[f, 1]] + at_vertex[faces[f, 2]], rotation)
+        cosine = 0.0
+        for a in range(3):
+            for b in range(3):
+                cosine += normals[f, a] * rotation[a, b] * normals_at_rest[f, b]
+        marked[f] = cosine < 0
 
 
 @njit(cache=True, nogil=True)

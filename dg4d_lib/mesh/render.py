@@ -15,7 +15,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
-SUPERSAMPLING = 2  # samples per pixel along each axis
+SUPERSAMPLING = 3  # samples per pixel along each axis; odd, so that no pixel is covered by exactly half
 LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera's axes (x right, y down, z forward)
 AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its color
 
@@ -23,7 +23,7 @@ AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its
 def render_mesh(
     mesh: TexturedMesh, cameras: Sequence[OrbitCamera], offsets: Float[Tensor, "*b v 3"] | None = None
 ) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-    """Render color and alpha of a mesh with four samples per pixel; differentiable in the texture.
+    """Render color and alpha of a mesh with nine samples per pixel; differentiable in the texture.
 
     Args:
         mesh: the mesh at rest.
@@ -31,7 +31,7 @@ def render_mesh(
         offsets: added to the vertices, world units; the same for all cameras ("v 3") or one state per camera ("b v 3").
 
     Returns:
-        Straight color in [0, 1] (0 where alpha is 0) and alpha in {0, 1/4, 1/2, 3/4, 1}.
+        Straight color in [0, 1] (0 where alpha is 0) and alpha in ninths.
 
     Raises:
         BadInput: no cameras, cameras of different sizes, or a number of mesh states that differs from the number of

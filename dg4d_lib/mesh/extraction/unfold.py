@@ -1,7 +1,10 @@
-"""Removal of folds and self-intersections from a surface by smoothing around them."""
+"""Folds and self-intersections of a surface: smoothing removes them; steps that would make new ones are shortened."""
+
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
+from scipy.sparse import csr_array
 
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
@@ -10,6 +13,8 @@ ROUNDS = 24  # at most; smoothing also shrinks, which makes new defects in the e
 WIDER = 6  # rounds after which one more ring of neighbors is smoothed
 SWEEPS = 3  # averagings with the neighbors per round
 STEP = 0.5  # share of the way to the mean of the neighbors
+ATTEMPTS, RINGS = 20, 3  # at steps without new defects, and those after which more vertices around these move less
+SHORTER = 0.5  # factor of their steps in the first half of the attempts; then they go back entirely
 
 
 def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
@@ -37,3 +42,35 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
         for _ in range(SWEEPS):
             smooth[here] += STEP * (means_here @ smooth - smooth[here])
     return best.astype(vertices.dtype)
+
+
+def without_new_defects(
+    start: Float[np.ndarray, "v 3"],
+    moved: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    edges: csr_array,
+    defective: Callable[[Float[np.ndarray, "v 3"]], Bool[np.ndarray, " f"]],
+) -> Float64[np.ndarray, "v 3"]:
+    """Return the moved vertices; near new defects they move less, ring by ring, until none is new.
+
+    Args:
+        start: vertices, which may have defects.
+        moved: the same vertices after a step.
+        faces: counter-clockwise seen from outside.
+        edges: adjacency of the vertices.
+        defective: marks the faces with defects in a pose (`DefectFinder`).
+    """
+    before = defective(start)
+    steps = moved - start.astype(np.float64)
+    share = np.ones((len(start), 1))
+    for attempt in range(ATTEMPTS):
+        kept = start + share * steps
+        present = defective(kept)
+        new = present & ~before
+        if not new.any():
+            return kept
+        early = attempt < ATTEMPTS // 2
+        # later around old ones, too: a new one may cross a face that crossed others before
+        around = grown(faces_to_vertices(new if early else present, faces, len(start)), edges, 1 + attempt // RINGS)
+        share[around] *= SHORTER if early else 0
+    return start.astype(np.float64)

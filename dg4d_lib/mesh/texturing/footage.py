@@ -18,13 +18,13 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import torch_on_one_thread
-from dg4d_lib.mesh.render import SUPERSAMPLING
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import INSIDE, PosedSurface, grade_pixels
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.texture import Taps, TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
+SAMPLES = 2  # per pixel along each axis; more take longer and show the same
 ITERATIONS = 4  # of conjugate gradients
 KEPT = 0.1  # weight of a texel's squared change; that of a pixel's squared error is 1
 EVEN = 0.1  # weight of the squared difference between the changes of neighboring texels
@@ -53,7 +53,7 @@ class _Pixels:
     def render(self, texture: Texture) -> Float[Tensor, "p 3"]:
         """Return the colors of the pixels with a texture; linear in it."""
         sums = texture.new_zeros((len(self.colors) + 1, 3))
-        return sums.index_add(0, self.pixels, sample_texture(texture, self.lookup))[:-1] / SUPERSAMPLING**2
+        return sums.index_add(0, self.pixels, sample_texture(texture, self.lookup))[:-1] / SAMPLES**2
 
 
 def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
@@ -105,13 +105,13 @@ def _flat(texture: Texture) -> NDArray[np.float64]:
 def _seen_pixels(mesh: TexturedMesh, surface: PosedSurface) -> _Pixels | None:
     """Return the pixels of a frame that both the subject and the mesh cover wholly, None if there are none."""
     camera = OrbitCamera(width=surface.color.shape[1], height=surface.color.shape[0])
-    fine = replace(camera, width=SUPERSAMPLING * camera.width, height=SUPERSAMPLING * camera.height)
+    fine = replace(camera, width=SAMPLES * camera.width, height=SAMPLES * camera.height)
     fragments = rasterize_mesh(surface.vertices, mesh.faces, [fine])
     lookup = build_lookup(surface.vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], [fine], fragments)
     weights = surface.weight * _trust(mesh, surface, camera)
     _, rows, columns = lookup.covered.nonzero().T
-    places = rows // SUPERSAMPLING * camera.width + columns // SUPERSAMPLING
-    full = torch.bincount(places, minlength=weights.numel()) == SUPERSAMPLING**2
+    places = rows // SAMPLES * camera.width + columns // SAMPLES
+    full = torch.bincount(places, minlength=weights.numel()) == SAMPLES**2
     used = full & (weights.flatten() > 0)
     if not bool(used.any()):
         return None

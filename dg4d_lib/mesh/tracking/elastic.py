@@ -18,6 +18,7 @@ from numba import njit
 from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
+from dg4d_lib.geometry.rotation import nearest_rotation
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
@@ -30,7 +31,6 @@ from dg4d_lib.mesh.neighbors import (
     grown,
     screened_factors,
 )
-from dg4d_lib.mesh.tracking.skinning import nearest_rotation
 
 Vertices = Float64[np.ndarray, "v 3"]
 
@@ -171,7 +171,7 @@ class ElasticBody:
     def rotations(self, moved: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3 3"]:
         """Return the rotation of every vertex that turns its edges at rest into the present ones best."""
         rotations = np.empty((len(moved), 3, 3))
-        _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, rotations)
+        _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, np.arange(len(moved)), rotations)
         return rotations
 
     def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
@@ -205,26 +205,28 @@ class ElasticBody:
             passes: alternations of rotations and positions.
         """
         moved, forces = start.copy(), np.empty_like(start)
-        rows: slice | Int[np.ndarray, " n"] = slice(None)
+        rotations = np.empty((len(start), 3, 3))
+        rows = near = np.arange(len(start))
         if free is None:
             solve = (self._whole if (pull == PULL).all() else screened_factors(self.laplacian, pull)).solve
         else:
-            rows = np.flatnonzero(free)
+            rows, near = np.flatnonzero(free), np.flatnonzero(grown(free, self.edges, 1))
             solve = screened_factors(self.laplacian[rows][:, rows], pull[rows]).solve
-            outside = self.laplacian[rows][:, ~free]
+            held = self.laplacian[rows][:, ~free] @ start[~free]
         for _ in range(passes):
-            _forces(self.edges.indptr, self.edges.indices, self.rest, self.rotations(moved), forces)
-            wanted = (forces + pull[:, None] * tracked)[rows]
-            moved[rows] = solve(wanted if free is None else wanted - outside @ moved[~free])
+            _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, near, rotations)
+            _forces(self.edges.indptr, self.edges.indices, self.rest, rotations, rows, forces)
+            wanted = forces[rows] + pull[rows, None] * tracked[rows]
+            moved[rows] = solve(wanted if free is None else wanted - held)
         return moved
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _rotations(starts, neighbors, rest, moved, rotations):
-    """Write the rotation of every vertex that turns its edges at rest into the present ones best."""
+def _rotations(starts, neighbors, rest, moved, chosen, rotations):
+    """Write the rotation of every chosen vertex that turns its edges at rest into the present ones best."""
     covariance = np.zeros((3, 3))
-    for v in range(rest.shape[0]):
+    for v in chosen:
         covariance[:] = 0
         for k in range(starts[v], starts[v + 1]):
             j = neighbors[k]
@@ -236,10 +238,10 @@ def _rotations(starts, neighbors, rest, moved, rotations):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _forces(starts, neighbors, rest, rotations, forces):
-    """Write the right-hand side of the positions: edges at rest, turned by the mean rotation of both ends."""
-    forces[:] = 0
-    for v in range(rest.shape[0]):
+def _forces(starts, neighbors, rest, rotations, chosen, forces):
+    """Write the right-hand side of chosen positions: edges at rest, turned by the mean rotation of both ends."""
+    for v in chosen:
+        forces[v] = 0
         for k in range(starts[v], starts[v + 1]):
             j = neighbors[k]
             for a in range(3):

@@ -8,6 +8,7 @@ import trimesh
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.fairing import LowPass, bump_filter, fair, strength_of, thickness
+from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph
 from dg4d_lib.mesh.tracking.isosurface_projection import steps_to_isosurface
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
@@ -80,6 +81,17 @@ def test_thin_limbs_keep_their_thickness() -> None:
     limb.merge_vertices()
     smooth = fair(np.asarray(limb.vertices, np.float32), np.asarray(limb.faces, np.int32), 0.25)
     assert trimesh.Trimesh(smooth, limb.faces).volume == pytest.approx(limb.volume, rel=0.15)
+
+
+def test_no_new_defects_on_thin_parts() -> None:
+    """A bumpy disk whose two sides the filter alone would fold in more places."""
+    vertices, faces = sphere()
+    x, y, z = vertices.T
+    disk = (1 + 0.05 * np.sin(20 * x) * np.sin(17 * y + 1))[:, None] * np.stack([x, y, 0.02 * z], 1)
+    defective = DefectFinder(faces).defective
+    faired = fair(disk.astype(np.float32), faces, 0.25)
+    assert not (defective(faired) & ~defective(disk.astype(np.float32))).any()
+    assert (np.abs(faired - disk).max(1) > 1e-6).mean() > 0.5
 
 
 def test_steps_to_a_bumpy_isosurface_have_no_bumps() -> None:

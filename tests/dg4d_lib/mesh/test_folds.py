@@ -6,8 +6,9 @@ import torch
 import trimesh
 
 from dg4d_lib.mesh.extraction.silhouettes import cameras_of, silhouette_iou
-from dg4d_lib.mesh.extraction.unfold import unfold
+from dg4d_lib.mesh.extraction.unfold import unfold, without_new_defects
 from dg4d_lib.mesh.folds import DefectFinder, genus, self_intersecting, surface_defects
+from dg4d_lib.mesh.neighbors import edge_graph
 from dg4d_lib.mesh.tracking.elastic import ElasticBody, relax, turn_back
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -97,6 +98,19 @@ def test_a_spike_through_the_other_side_is_smoothed_away() -> None:
     assert (defects.self_intersecting, defects.folds) == (0, 0)
     assert (smooth == spiked).all(1).mean() > 0.9
     assert unfold(vertices, faces) is not vertices and np.array_equal(unfold(vertices, faces), vertices)
+
+
+def test_steps_are_shorter_around_new_defects_alone() -> None:
+    """A sphere that grows, but for a spike through its other side; an old spike may stay."""
+    vertices, faces = sphere()
+    vertices[5] *= -1.3
+    grown = 1.1 * vertices
+    grown[0] *= -1.3
+    edges, defective = edge_graph(faces, len(vertices)), DefectFinder(faces).defective
+    kept = without_new_defects(vertices, grown, faces, edges, defective)
+    assert (defective(grown) & ~defective(vertices)).any() and defective(kept).any()
+    assert not (defective(kept) & ~defective(vertices)).any()
+    assert (kept == grown).all(1).mean() > 0.8 and (kept[0] != grown[0]).all()
 
 
 def test_unfolding_tests_moved_faces_alone_and_misses_none(monkeypatch: pytest.MonkeyPatch) -> None:

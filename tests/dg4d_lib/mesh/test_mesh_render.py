@@ -30,11 +30,11 @@ def test_the_top_left_of_the_texture_is_the_top_left_of_the_picture(board: Textu
     assert alpha.sum() == 16 * 16
 
 
-def test_half_covered_pixels_keep_their_color(board: TexturedMesh) -> None:
+def test_partly_covered_pixels_keep_their_color(board: TexturedMesh) -> None:
     pixel = 2 * HALF / SIZE
-    shifted = board.vertices.new_tensor([0.5 * pixel, 0, 0]).expand_as(board.vertices)
+    shifted = board.vertices.new_tensor([pixel / 3, 0, 0]).expand_as(board.vertices)
     color, alpha = render_mesh(board, [CAMERA], shifted)
-    assert alpha[0, 10, 8, 0] == 0.5
+    assert alpha[0, 10, 8, 0] == pytest.approx(2 / 3)
     torch.testing.assert_close(color[0, 10, 8], torch.tensor([1.0, 0, 0]))
 
 
