@@ -110,7 +110,7 @@ def test_steps_are_shorter_around_new_defects_alone() -> None:
     kept = without_new_defects(vertices, grown, faces, edges, defective)
     assert (defective(grown) & ~defective(vertices)).any() and defective(kept).any()
     assert not (defective(kept) & ~defective(vertices)).any()
-    assert (kept == grown).all(1).mean() > 0.8 and (kept[0] != grown[0]).all()
+    assert (kept == grown).all(1).mean() > 0.8 and (kept[0] != grown[0]).any()
 
 
 def test_unfolding_tests_moved_faces_alone_and_misses_none(monkeypatch: pytest.MonkeyPatch) -> None:
