@@ -38,6 +38,7 @@ from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture, drawn
 from dg4d_lib.mesh.texturing.chart_packing import QUICK, THOROUGH, Effort
 from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
+from dg4d_lib.mesh.tracking.color_registration import register_to_colors
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
@@ -232,13 +233,14 @@ def _tracked(
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
         relaxed = relax(vertices, registered, faces, silhouettes)
-        if video is not None:
-            relaxed = fit_outline_detail(vertices, relaxed, faces, video.alpha[..., 0])
-        offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
-        ious = silhouette_iou(vertices + offsets, faces, silhouettes)
         mesh, sources = coloring.result()
     if video is not None:
-        mesh = _fitted(mesh, vertices + offsets, faces, sources, video)
+        fitted = partial(_fitted, vertices=vertices, faces=faces, sources=sources, video=video)
+        mesh, relaxed = _registered(mesh, fitted, sources, vertices, relaxed, faces, video)
+    offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
+    ious = silhouette_iou(vertices + offsets, faces, silhouettes)
+    if video is not None:
+        mesh = fitted(mesh, offsets=offsets)
     notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
@@ -277,15 +279,12 @@ def _guided(
         vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )  # fmt: skip
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
-    refined = fit_outline_detail(vertices, refined, faces, video.alpha[..., 0])
+    baked = partial(_baked, vertices=vertices, faces=faces, sources=sources, draw=draw, settings=settings, video=video)
+    mesh, refined = _registered(mesh, baked, sources, vertices, refined, faces, video)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined, separated = _sound(vertices, refined, faces, silhouettes, video)
-    moved = vertices + refined
-    normals, footage = vertex_normals(vertices, faces)[sources], _footage(moved, faces, sources, video, mesh)
-    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, draw, settings, footage)
-    mesh = _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
-    tracked = TrackedMesh(mesh, refined[:, sources], reference_frame=best.frame)
-    return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *separated]
+    tracked = TrackedMesh(baked(mesh, offsets=refined), refined[:, sources], reference_frame=best.frame)
+    return tracked, silhouette_iou(vertices + refined, faces, silhouettes), [*notes, *separated]
 
 
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
@@ -323,16 +322,49 @@ def _sound(
     return turn_back(vertices + first, turned - first, faces, silhouettes) + first, notes
 
 
+def _registered(
+    mesh: TexturedMesh,
+    textured: Callable[..., TexturedMesh],
+    sources: Int[Tensor, " w"],
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    video: DrivingVideo,
+) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
+    """Return the mesh with a texture from the video, and offsets that agree with the video's colors and outlines."""
+    mesh, pictures = textured(mesh, offsets=offsets), video.over(video.frames.new_ones(3))
+    offsets = register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
+    return mesh, fit_outline_detail(vertices, offsets, faces, video.alpha[..., 0])
+
+
 def _fitted(
     mesh: TexturedMesh,
-    moved: Float[Tensor, "t v 3"],
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     sources: Int[Tensor, " w"],
     video: DrivingVideo,
 ) -> TexturedMesh:
     """Return the mesh with its texture fitted to the video."""
-    footage = _footage(moved, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
+    footage = _footage(vertices + offsets, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
     return replace(mesh, texture=fit_texture(mesh, footage))
+
+
+def _baked(
+    mesh: TexturedMesh,
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    sources: Int[Tensor, " w"],
+    draw: Draw,
+    settings: MeshSettings,
+    video: DrivingVideo,
+) -> TexturedMesh:
+    """Return the mesh with a texture baked anew from the frames that it follows best, and fitted to the video."""
+    footage = _footage(vertices + offsets, faces, sources, video, mesh)
+    normals = vertex_normals(vertices, faces)[sources]
+    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, draw, settings, footage)
+    return _fitted(replace(mesh, texture=texture), vertices, offsets, faces, sources, video)
 
 
 def _footage(

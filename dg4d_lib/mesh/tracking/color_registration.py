@@ -14,13 +14,16 @@ from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.images import color_over_white, luminance
+from dg4d_lib.images import color_over_white, luminance, resize
 from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.unfold import without_new_defects
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
+SIZE = 256  # pixels of the compared pictures, at most: flow is finer than a pixel
+WHITE, MARGIN = 0.99, 16  # luminance above which a pixel shows no subject, and pixels around the subject that count
 ROTATIONS = 2  # alternations of rotations and positions
 HIDDEN_PULL, SHOWN_PULL = 0.1, 1.5  # weights of the positions of hidden and of shown vertices, against 1 per edge
 
@@ -32,6 +35,7 @@ def register_to_colors(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     pictures: Float[Tensor, "t h w 3"],
+    sound: bool = False,
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets by which renders of the mesh agree with the pictures.
 
@@ -42,20 +46,23 @@ def register_to_colors(
         offsets: of the tracked vertices at every frame.
         faces: counter-clockwise seen from outside, not split along seams.
         pictures: frames of the driving video over white.
+        sound: frames get no defects that they do not have.
     """
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
-    registered = torch.empty_like(offsets)
+    registered, size = torch.empty_like(offsets), min(SIZE, pictures.shape[1])
 
     def register_frame(frame: int) -> None:
         moved = vertices + offsets[frame]
-        expected = pictures[frame]
+        expected = resize(pictures[frame, None], (size, size))[0]
         camera = OrbitCamera(width=expected.shape[1], height=expected.shape[0])
         color, alpha = render_mesh(replace(mesh, vertices=moved[sources]), [camera])
-        flow = np.stack(optical_flow_tvl1(_luma(color_over_white(color, alpha)[0]), _luma(expected)))
+        flow = _flow(_luma(color_over_white(color, alpha)[0]), _luma(expected))
         steps, share = steps_of_flow(moved, faces, flow, camera)
         start = moved.double().numpy()
         pull = HIDDEN_PULL + (SHOWN_PULL - HIDDEN_PULL) * share.clip(max=1)
         settled = body.settle(start, start + steps, pull, passes=ROTATIONS)
+        if sound:
+            settled = without_new_defects(start, settled, body.faces, body.edges, body.defective)
         registered[frame] = torch.from_numpy(settled).to(offsets) - vertices
 
     run_parallel([partial(register_frame, frame) for frame in range(len(offsets))])
@@ -88,6 +95,17 @@ def steps_of_flow(
     share = np.bincount(corners, weights.ravel(), len(moved)).astype(np.float64)
     sums = [np.bincount(corners, (weights * part[:, None]).ravel(), len(moved)) for part in in_world.T]
     return np.stack(sums, 1) / np.maximum(share, 1e-6)[:, None], share
+
+
+def _flow(first: Float[np.ndarray, "h w"], second: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "2 h w"]:
+    """Return rows and columns by which pixels move from one picture over white to another; 0 far from the subject."""
+    flow = np.zeros((2, *first.shape))
+    shown = np.minimum(first, second) < WHITE
+    if shown.any():
+        rows, columns = (np.flatnonzero(shown.any(axis)) for axis in (1, 0))
+        near = tuple(slice(max(0, at[0] - MARGIN), at[-1] + 1 + MARGIN) for at in (rows, columns))
+        flow[:, *near] = optical_flow_tvl1(first[near], second[near])
+    return flow
 
 
 def _luma(color: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
