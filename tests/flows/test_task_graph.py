@@ -153,7 +153,7 @@ def test_independent_steps_and_the_meshes_of_all_frames_run_side_by_side(
             running.discard(event.step)
         most[event.step.partition(" ")[0]] = max(most.get(event.step.partition(" ")[0], 0), len(running))
 
-    words = "wide drive_video=sleep:1 fit_gaussians=sleep:1 extract_mesh=sleep:2 drive_video=frames:16"
+    words = "wide drive_video=sleep:1 fit_gaussians=sleep:1 extract_mesh=sleep:6 drive_video=frames:16"
     with listening(watch):
         convert_job(job(words, tmp_path, **{"mesh.mode": "per_frame"}), tmp_path / "out")
     assert max(most["drive_video"], most["fit_gaussians"]) == 2
