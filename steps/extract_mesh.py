@@ -61,6 +61,7 @@ from steps.runtime.job import Job, StepReport
 Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
 Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
 Surface = tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]
+Textured = Callable[[TexturedMesh, Float[Tensor, "t v 3"]], TexturedMesh]  # gives a mesh its texture, by its positions
 
 COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
 SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squared error
@@ -235,12 +236,12 @@ def _tracked(
         relaxed = relax(vertices, registered, faces, silhouettes)
         mesh, sources = coloring.result()
     if video is not None:
-        fitted = partial(_fitted, vertices=vertices, faces=faces, sources=sources, video=video)
-        mesh, relaxed = _registered(mesh, fitted, sources, vertices, relaxed, faces, video)
+        textured = partial(_fitted, faces=faces, sources=sources, video=video)
+        mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video)
     offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     if video is not None:
-        mesh = fitted(mesh, offsets=offsets)
+        mesh = textured(mesh, vertices + offsets)
     notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
@@ -279,12 +280,16 @@ def _guided(
         vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )  # fmt: skip
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
-    baked = partial(_baked, vertices=vertices, faces=faces, sources=sources, draw=draw, settings=settings, video=video)
-    mesh, refined = _registered(mesh, baked, sources, vertices, refined, faces, video)
+    normals = vertex_normals(vertices, faces)[sources]
+    textured = partial(
+        _baked, faces=faces, sources=sources, video=video, normals=normals, draw=draw, settings=settings
+    )  # fmt: skip
+    mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
     refined, separated = _sound(vertices, refined, faces, silhouettes, video)
-    tracked = TrackedMesh(baked(mesh, offsets=refined), refined[:, sources], reference_frame=best.frame)
-    return tracked, silhouette_iou(vertices + refined, faces, silhouettes), [*notes, *separated]
+    moved = vertices + refined
+    tracked = TrackedMesh(textured(mesh, moved), refined[:, sources], reference_frame=best.frame)
+    return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *separated]
 
 
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
@@ -324,7 +329,7 @@ def _sound(
 
 def _registered(
     mesh: TexturedMesh,
-    textured: Callable[..., TexturedMesh],
+    textured: Textured,
     sources: Int[Tensor, " w"],
     vertices: Float[Tensor, "v 3"],
     offsets: Float[Tensor, "t v 3"],
@@ -332,39 +337,37 @@ def _registered(
     video: DrivingVideo,
 ) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
     """Return the mesh with a texture from the video, and offsets that agree with the video's colors and outlines."""
-    mesh, pictures = textured(mesh, offsets=offsets), video.over(video.frames.new_ones(3))
+    mesh, pictures = textured(mesh, vertices + offsets), video.over(video.frames.new_ones(3))
     offsets = register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
     return mesh, fit_outline_detail(vertices, offsets, faces, video.alpha[..., 0])
 
 
 def _fitted(
     mesh: TexturedMesh,
-    vertices: Float[Tensor, "v 3"],
-    offsets: Float[Tensor, "t v 3"],
+    moved: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     sources: Int[Tensor, " w"],
     video: DrivingVideo,
 ) -> TexturedMesh:
     """Return the mesh with its texture fitted to the video."""
-    footage = _footage(vertices + offsets, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
+    footage = _footage(moved, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
     return replace(mesh, texture=fit_texture(mesh, footage))
 
 
 def _baked(
     mesh: TexturedMesh,
-    vertices: Float[Tensor, "v 3"],
-    offsets: Float[Tensor, "t v 3"],
+    moved: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     sources: Int[Tensor, " w"],
+    video: DrivingVideo,
+    normals: Float[Tensor, "w 3"],
     draw: Draw,
     settings: MeshSettings,
-    video: DrivingVideo,
 ) -> TexturedMesh:
     """Return the mesh with a texture baked anew from the frames that it follows best, and fitted to the video."""
-    footage = _footage(vertices + offsets, faces, sources, video, mesh)
-    normals = vertex_normals(vertices, faces)[sources]
+    footage = _footage(moved, faces, sources, video, mesh)
     texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, draw, settings, footage)
-    return _fitted(replace(mesh, texture=texture), vertices, offsets, faces, sources, video)
+    return _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
 
 
 def _footage(

@@ -24,7 +24,7 @@ from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.texture import Taps, TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
-SAMPLES = 2  # per pixel along each axis; more take longer and show the same
+SAMPLES = 2  # per pixel along each axis
 ITERATIONS = 4  # of conjugate gradients
 KEPT = 0.1  # weight of a texel's squared change; that of a pixel's squared error is 1
 EVEN = 0.1  # weight of the squared difference between the changes of neighboring texels
