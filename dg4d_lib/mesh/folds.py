@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from numba import njit
 
 from dg4d_lib.geometry.rotation import nearest_rotation
 from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.topology import face_components
-from dg4d_lib.mesh.neighbors import half_edges, mesh_edges
+from dg4d_lib.mesh.neighbors import faces_to_vertices, half_edges, mesh_edges
 
 configure_numba()
 
@@ -59,19 +59,42 @@ class DefectFinder:
             self._normals_at_rest = unit_normals(rest, faces)
 
     def defective(
-        self, vertices: Float[np.ndarray, "v 3"], moved: Bool[np.ndarray, " v"] | None = None
+        self, vertices: Float[np.ndarray, "v 3"], near: Bool[np.ndarray, " f"] | None = None
     ) -> Bool[np.ndarray, " f"]:
         """Mark faces that intersect others, are flipped or lie at a fold.
 
         Args:
             vertices: of the pose.
-            moved: vertices outside of which faces are known not to intersect, which saves most of the time; None: all.
+            near: faces that are searched; of the others, only some that share a defect with one of them are marked.
+                None: all.
         """
         normals = unit_normals(vertices, self._faces)
-        marked = self_intersecting(vertices, self._faces, moved) | self._flipped(vertices, normals)
+        marked = self_intersecting(vertices, self._faces, near) | self._flipped(vertices, normals, near)
         folded = self._cosines(normals) < np.cos(np.radians(FOLD_DEG))
+        if near is not None:
+            folded &= near[self._first] | near[self._second]
         marked[self._first[folded]] = marked[self._second[folded]] = True
         return marked
+
+    def updated(
+        self, marked: Bool[np.ndarray, " f"], before: Float[np.ndarray, "v 3"], vertices: Float[np.ndarray, "v 3"]
+    ) -> Bool[np.ndarray, " f"]:
+        """Mark the same as `defective` in less time, where the pose differs from another one in some places.
+
+        Args:
+            marked: defective faces of the other pose.
+            before: vertices of the other pose.
+            vertices: of the pose.
+        """
+        touched = (before != vertices).any(1)[self._faces].any(1)
+        if not touched.any():
+            return marked
+        # two faces that did not move may still cross, so what is near is searched again
+        places = np.concatenate([before[self._faces[touched]], vertices[self._faces[touched]]]).reshape(-1, 3)
+        low, high = _boxes(vertices, self._faces)
+        near = ((low <= places.max(0)) & (high >= places.min(0))).all(1)
+        near |= faces_to_vertices(touched, self._faces, len(vertices))[self._faces].any(1)
+        return np.where(near, self.defective(vertices, near), marked)
 
     def flipped(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
         """Mark faces that point against the local rotation of the surface; none without a rest shape."""
@@ -94,16 +117,23 @@ class DefectFinder:
         """Return the cosine between the normals of the two faces of every inner edge."""
         return np.einsum("ei,ei->e", normals[self._first], normals[self._second])
 
-    def _flipped(self, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-        """Mark faces whose normal points against the rotation that fits the neighborhood best.
+    def _flipped(
+        self,
+        vertices: Float[np.ndarray, "v 3"],
+        normals: Float[np.ndarray, "f 3"],
+        near: Bool[np.ndarray, " f"] | None = None,
+    ) -> Bool[np.ndarray, " f"]:
+        """Mark faces, of those near, whose normal points against the rotation that fits the neighborhood best.
 
         The neighborhood of a face are the edges at its three corners; the rotation is that of Kabsch.
         """
-        if self._rest is None:
-            return np.zeros(len(self._faces), np.bool_)
         marked = np.zeros(len(self._faces), np.bool_)
+        if self._rest is None:
+            return marked
+        searched = np.ones_like(marked) if near is None else near
+        corners = faces_to_vertices(searched, self._faces, len(vertices))
         poses = (np.asarray(pose, np.float64) for pose in (vertices, self._rest))
-        _mark_flipped(*poses, self._faces, normals, self._normals_at_rest, marked)
+        _mark_flipped(*poses, self._faces, normals, self._normals_at_rest, searched, corners, marked)
         return marked
 
 
@@ -152,7 +182,7 @@ def area_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
 
 
 def self_intersecting(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], moved: Bool[np.ndarray, " v"] | None = None
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], near: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Mark faces that an edge of another face crosses, or that cross another face with an edge of their own.
 
@@ -161,32 +191,56 @@ def self_intersecting(
     Args:
         vertices: positions.
         faces: indices into the vertices.
-        moved: pairs of faces without such a corner are known not to cross; None: no pair is.
+        near: faces that are searched; of the others, those that cross one of them are marked. None: all.
     """
-    points = np.ascontiguousarray(vertices, np.float64)
-    corners = np.ascontiguousarray(faces, np.int64)
-    marked = np.zeros(len(corners), np.bool_)
-    if len(corners) == 0:
+    marked = np.zeros(len(faces), np.bool_)
+    searched = np.ones_like(marked) if near is None else near
+    if not searched.any():
         return marked
-    a, b, c = points[corners[:, 0]], points[corners[:, 1]], points[corners[:, 2]]
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)  # four times as fast as along an axis
+    low, high = _boxes(vertices, faces)
+    if near is not None:
+        some = np.flatnonzero(((low <= high[near].max(0)) & (high >= low[near].min(0))).all(1))
+        marked[some] = _crossing(vertices, faces[some], low[some], high[some], searched[some])
+        return marked
+    return _crossing(vertices, faces, low, high, searched)
+
+
+def _boxes(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarray, "f 3"]]:
+    """Return the lowest and highest coordinates of every face."""
+    a, b, c = (vertices[corner].astype(np.float64) for corner in faces.T)
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)  # four times as fast as along an axis
+
+
+def _crossing(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    low: Float64[np.ndarray, "f 3"],
+    high: Float64[np.ndarray, "f 3"],
+    searched: Bool[np.ndarray, " f"],
+) -> Bool[np.ndarray, " f"]:
+    """Mark faces that cross a searched one, or are searched and cross any, by a grid of cells."""
+    marked = np.zeros(len(faces), np.bool_)
     extent = float((high.max(0) - low.min(0)).max())
     cell = max(2 * float((high - low).mean()), extent / LONGEST_CELLS, 1e-300)
     first = ((low - low.min(0)) / cell).astype(np.int64)
     last = ((high - low.min(0)) / cell).astype(np.int64)
     shape = last.max(0) + 1
     starts, members = _fill_grid(first, last, shape)
-    tested = np.ones(len(corners), np.bool_) if moved is None else moved[corners].any(1)
-    _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, tested, marked)
+    points, corners = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, searched, marked)
     return marked
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _mark_flipped(vertices, rest, faces, normals, normals_at_rest, marked):
-    """Mark the faces whose normals point against those at rest, turned with their neighborhood."""
+def _mark_flipped(vertices, rest, faces, normals, normals_at_rest, searched, corners, marked):
+    """Mark the searched faces, with their corners, whose normals point against those at rest, turned as around them."""
     at_vertex = np.zeros((len(vertices), 3, 3))
     for face in faces:
+        if not (corners[face[0]] or corners[face[1]] or corners[face[2]]):
+            continue
         for k in range(3):
             i, j = face[k], face[(k + 1) % 3]
             for a in range(3):
@@ -195,7 +249,7 @@ def _mark_flipped(vertices, rest, faces, normals, normals_at_rest, marked):
                     at_vertex[i, a, b] += product
                     at_vertex[j, a, b] += product
     rotation = np.empty((3, 3))
-    for f in range(len(faces)):
+    for f in np.flatnonzero(searched):
         nearest_rotation(at_vertex[faces[f, 0]] + at_vertex[faces[f, 1]] + at_vertex[faces[f, 2]], rotation)
         cosine = 0.0
         for a in range(3):
@@ -231,14 +285,14 @@ def _fill_grid(first, last, shape):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _cross_faces(points, faces, low, high, origin, size, shape, starts, members, tested, marked):
-    """Mark the faces that cross another one, pairs with a `tested` face, in the first cell that both boxes share."""
+def _cross_faces(points, faces, low, high, origin, size, shape, starts, members, searched, marked):
+    """Mark the faces that cross another one, pairs with a searched face, in the first cell that both boxes share."""
     for cell in range(len(starts) - 1):
         z, y, x = cell % shape[2], cell // shape[2] % shape[1], cell // (shape[1] * shape[2])
         for m in range(starts[cell], starts[cell + 1]):
             for n in range(starts[cell], m):
                 i, j = members[m], members[n]
-                if (marked[i] and marked[j]) or not (tested[i] or tested[j]):
+                if (marked[i] and marked[j]) or not (searched[i] or searched[j]):
                     continue
                 apart = False
                 for axis in range(3):

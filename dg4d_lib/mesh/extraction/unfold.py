@@ -28,9 +28,9 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
     fewest, best = len(faces) + 1, smooth
-    moved: Bool[np.ndarray, " v"] | None = None
+    moved: Bool[np.ndarray, " v"] | None = None  # outside of it, nothing was ever wrong
     for number in range(ROUNDS):
-        defective = finder.defective(smooth, moved)
+        defective = finder.defective(smooth, None if moved is None else moved[faces].any(1))
         if defective.sum() < fewest:
             fewest, best = defective.sum(), smooth.copy()
         if fewest == 0:
@@ -49,7 +49,7 @@ def without_new_defects(
     moved: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
     edges: csr_array,
-    defective: Callable[[Float[np.ndarray, "v 3"]], Bool[np.ndarray, " f"]],
+    defective: Callable[[Float[np.ndarray, "v 3"], Bool[np.ndarray, " f"] | None], Bool[np.ndarray, " f"]],
 ) -> Float64[np.ndarray, "v 3"]:
     """Return the moved vertices; near new defects they move less, ring by ring, until none is new.
 
@@ -58,19 +58,20 @@ def without_new_defects(
         moved: the same vertices after a step.
         faces: counter-clockwise seen from outside.
         edges: adjacency of the vertices.
-        defective: marks the faces with defects in a pose (`DefectFinder`).
+        defective: marks the faces with defects in a pose, of all or at least of those near (`DefectFinder.defective`).
     """
-    before = defective(start)
+    before, near = defective(start, None), None
     steps = moved - start.astype(np.float64)
     share = np.ones((len(start), 1))
     for attempt in range(ATTEMPTS):
         kept = start + share * steps
-        present = defective(kept)
+        early = attempt < ATTEMPTS // 2
+        present = defective(kept, near if early else None)
         new = present & ~before
         if not new.any():
             return kept
-        early = attempt < ATTEMPTS // 2
         # later around old ones, too: a new one may cross a face that crossed others before
         around = grown(faces_to_vertices(new if early else present, faces, len(start)), edges, 1 + attempt // RINGS)
         share[around] *= SHORTER if early else 0
+        near = grown(around, edges, 1)[faces].any(1)  # what else is new is around, too; flips show one ring farther
     return start.astype(np.float64)

@@ -8,8 +8,7 @@ Where limbs cross, it must give way far around them, which may move outlines; th
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from operator import itemgetter
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import torch
@@ -59,6 +58,13 @@ class Effort:
 GENTLE, STRONG = Effort(5, 3, 0.15), Effort(12, 10, 0.05)
 
 
+class Pose(NamedTuple):
+    """Vertices of one frame, and the faces with defects that the rest shape does not have."""
+
+    vertices: Vertices
+    defective: Bool[np.ndarray, " f"]
+
+
 def relax(
     vertices: Float[Tensor, "v 3"],
     offsets: Float[Tensor, "t v 3"],
@@ -79,13 +85,11 @@ def relax(
 
     def relax_frame(frame: int) -> None:
         tracked = (vertices + offsets[frame]).double().numpy()
-        moved = body.relaxed(tracked, GENTLE)
-        if silhouettes is not None and body.defective(moved).any():
+        moved, left = body.relaxed(tracked, GENTLE)
+        if silhouettes is not None and left:
             outline = silhouettes[frame, None]
-            strong = body.relaxed(tracked, STRONG)
-            if body.defective(strong).sum() < body.defective(moved).sum() and (
-                _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS
-            ):
+            strong, still_left = body.relaxed(tracked, STRONG)
+            if still_left < left and (_iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS):
                 moved = strong
         relaxed[frame] = torch.from_numpy(moved - body.rest).to(offsets)
 
@@ -117,21 +121,29 @@ def turn_back(
         moved = (vertices + offsets[frame]).double().numpy()
         outline = silhouettes[frame, None]
 
-        def best(present: Vertices, attempts: list[Vertices]) -> Vertices:
-            fewest = body.defective(present).sum()
-            defects = [body.defective(attempt).sum() for attempt in attempts]
-            for count, attempt in sorted(zip(defects, attempts, strict=True), key=itemgetter(0)):
-                if count < fewest and _iou(attempt, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
-                    return attempt
+        places = body.flipped_places(moved)
+        if not places:
+            return
+        least = _iou(moved, faces, outline) - MAX_LOSS
+
+        def best(present: Pose, attempts: list[Vertices]) -> Pose:
+            poses = [Pose(one, body.updated(present.defective, present.vertices, one)) for one in attempts]
+            for pose in sorted(poses, key=lambda pose: int(pose.defective.sum())):
+                if pose.defective.sum() >= present.defective.sum():
+                    break
+                if _iou(pose.vertices, faces, outline) >= least:
+                    return pose
             return present
 
-        present = moved
-        for place in body.flipped_places(moved):
+        pose = Pose(moved, body.defective(moved))
+        for place in places:
             regions = [grown(place, body.edges, rings) for rings in NEARBY]
-            present = best(present, [body.settle(present, present, loose, region, LONG) for region in regions])
+            start = pose.vertices
+            pose = best(pose, [body.settle(start, start, loose, region, LONG) for region in regions])
+        present = pose.vertices
         repaired, _ = unflip(body.rest, present, body.faces, body.rotations(present))
         if repaired is not present:
-            present = best(present, [repaired])
+            present = best(pose, [repaired]).vertices
         if present is not moved:
             turned[frame] = torch.from_numpy(present - body.rest).to(offsets)
 
@@ -158,9 +170,17 @@ class ElasticBody:
         """Factors for vertices that are all free and pulled alike; only `relaxed` needs them."""
         return screened_factors(self.laplacian, np.full(len(self.rest), PULL))
 
-    def defective(self, moved: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
-        """Mark the faces with defects that the rest shape does not have."""
-        return self._finder.defective(moved) & self._sound_at_rest
+    def defective(
+        self, moved: Float64[np.ndarray, "v 3"], near: Bool[np.ndarray, " f"] | None = None
+    ) -> Bool[np.ndarray, " f"]:
+        """Mark the faces with defects that the rest shape does not have; with `near`, at least those among these."""
+        return self._finder.defective(moved, near) & self._sound_at_rest
+
+    def updated(
+        self, defective: Bool[np.ndarray, " f"], before: Float64[np.ndarray, "v 3"], moved: Float64[np.ndarray, "v 3"]
+    ) -> Bool[np.ndarray, " f"]:
+        """Return the defective faces, given those of other positions, which saves time where few vertices differ."""
+        return self._finder.updated(defective, before, moved) & self._sound_at_rest
 
     def flipped_places(self, moved: Float64[np.ndarray, "v 3"]) -> list[Bool[np.ndarray, " v"]]:
         """Mark the corners of faces that point against the local rotation of the surface, one connected place each."""
@@ -174,18 +194,19 @@ class ElasticBody:
         _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, np.arange(len(moved)), rotations)
         return rotations
 
-    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> Float64[np.ndarray, "v 3"]:
-        """Return the relaxed positions of one frame."""
+    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> tuple[Float64[np.ndarray, "v 3"], int]:
+        """Return the relaxed positions of one frame, and how many faces have defects there."""
         pull = np.full(len(tracked), PULL)
         moved = self.settle(tracked, tracked, pull)
+        defective = self.defective(moved)
         for _ in range(effort.rounds - 1):
-            defective = self.defective(moved)
             if not defective.any():
                 break
             yielding = grown(faces_to_vertices(defective, self.faces, len(moved)), self.edges, effort.rings)
             pull[yielding] *= effort.yielding
-            moved = self.settle(moved, tracked, pull, yielding)
-        return moved
+            before, moved = moved, self.settle(moved, tracked, pull, yielding)
+            defective = self.updated(defective, before, moved)
+        return moved, int(defective.sum())
 
     def settle(
         self,

@@ -119,19 +119,33 @@ def test_unfolding_tests_moved_faces_alone_and_misses_none(monkeypatch: pytest.M
     fast = unfold(noisy, faces)
     assert DefectFinder(faces).defective(noisy).any() and (fast == noisy).all(1).mean() > 0.5
     search = DefectFinder.defective
-    monkeypatch.setattr(DefectFinder, "defective", lambda self, vertices, moved=None: search(self, vertices))
+    monkeypatch.setattr(DefectFinder, "defective", lambda self, vertices, near=None: search(self, vertices))
     assert np.array_equal(fast, unfold(noisy, faces))
 
 
-def test_faces_that_did_not_move_are_not_tested_again() -> None:
+def test_only_faces_nearby_are_searched() -> None:
     vertices, faces = sphere(2)
     both, joined = (
         np.concatenate([vertices, vertices + np.array([1.0, 0, 0])]),
         np.concatenate([faces, faces + len(vertices)]),
     )
     everywhere = self_intersecting(both, joined)
-    assert not self_intersecting(both, joined, np.zeros(len(both), bool)).any()
-    assert np.array_equal(self_intersecting(both, joined, np.arange(len(both)) < len(vertices)), everywhere)
+    assert not self_intersecting(both, joined, np.zeros(len(joined), bool)).any()
+    assert np.array_equal(self_intersecting(both, joined, np.arange(len(joined)) < len(faces)), everywhere)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_defects_after_a_change_in_one_place_are_those_of_a_whole_search(seed: int) -> None:
+    vertices, faces = tube()
+    draws = np.random.default_rng(seed)
+    finder = DefectFinder(faces, vertices)
+    before = vertices + 0.02 * draws.normal(size=vertices.shape) * (vertices[:, :1] > 0.5)
+    place = np.linalg.norm(vertices - vertices[draws.integers(len(vertices))], axis=1) < 0.15
+    after = np.where(place[:, None], vertices + 0.03 * draws.normal(size=vertices.shape), before)
+    marked, expected = finder.defective(before), finder.defective(after)
+    assert (marked != expected).any()
+    assert np.array_equal(finder.updated(marked, before, after), expected)
+    assert finder.updated(marked, before, before) is marked
 
 
 def test_more_rounds_of_smoothing_never_leave_more_defects(monkeypatch: pytest.MonkeyPatch) -> None:
