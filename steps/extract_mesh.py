@@ -28,6 +28,7 @@ from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.extraction.strands import grow_strands
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
@@ -127,7 +128,7 @@ def run(job: Job) -> StepReport:
         if settings.source == "prior" and video and "subject" in job.inputs:
             guesses = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
             weights = packaged.digests()
-        rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses)
+        rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses, video)
         if video and plan.guide == "video":
             tracked, ious, notes = _guided(job, rest_shape, states, video, plan, rasterize, settings)
         else:
@@ -177,8 +178,9 @@ def textured_mesh(
     """Return the isosurface of one state of the Gaussians at a density, with a texture baked from it and the frame."""
     vertices, faces = _isosurface(gaussians, level, rasterize, settings)
     if frame is not None:
-        alpha = frame[1][None, ..., 0]
-        vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha)[0]
+        alpha = frame[1][..., 0]
+        vertices, faces = grow_strands(vertices, faces, alpha)
+        vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha[None])[0]
     shown = _shown(vertices, faces, frame)
     mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
@@ -201,17 +203,22 @@ def _rest_shape(
     rasterize: Rasterizer,
     settings: MeshSettings,
     guesses: SubjectShapes | None,
+    video: DrivingVideo | None,
     frame: int,
 ) -> RestShape:
-    """Return the guess of a frame, or without guesses the isosurface of the Gaussians."""
+    """Return the guess of a frame, or without guesses the isosurface of the Gaussians, with strands of the video."""
     gaussians = states.at(frame)
     if guesses is None:
-        return RestShape(
-            *_isosurface(gaussians, level, rasterize, settings), gaussians, drawn_gaussians(gaussians, rasterize)
-        )
-    guess, unit = guesses.surface(frame), density_field(gaussians, settings).unit
-    vertices, faces = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
-    return RestShape(*_faired(vertices, faces, settings), gaussians, partial(render_surface, guess))
+        vertices, faces = _isosurface(gaussians, level, rasterize, settings)
+        draw = drawn_gaussians(gaussians, rasterize)
+    else:
+        guess, unit = guesses.surface(frame), density_field(gaussians, settings).unit
+        rough = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
+        vertices, faces = _faired(*rough, settings)
+        draw = partial(render_surface, guess)
+    if video is not None:
+        vertices, faces = grow_strands(vertices, faces, video.alpha[frame, ..., 0])
+    return RestShape(vertices, faces, gaussians, draw)
 
 
 def _tracked(

@@ -68,12 +68,15 @@ class DefectFinder:
             near: faces that are searched; of the others, only some that share a defect with one of them are marked.
                 None: all.
         """
-        normals = unit_normals(vertices, self._faces)
-        marked = self_intersecting(vertices, self._faces, near) | self._flipped(vertices, normals, near)
-        folded = self._cosines(normals) < np.cos(np.radians(FOLD_DEG))
-        if near is not None:
-            folded &= near[self._first] | near[self._second]
-        marked[self._first[folded]] = marked[self._second[folded]] = True
+        searched = np.ones(len(self._faces), np.bool_) if near is None else near
+        at_edges = searched[self._first] | searched[self._second]
+        first, second = self._first[at_edges], self._second[at_edges]
+        around, normals = searched.copy(), np.zeros((len(self._faces), 3))
+        around[first] = around[second] = True
+        normals[around] = unit_normals(vertices, self._faces[around])
+        marked = self_intersecting(vertices, self._faces, near) | self._flipped(vertices, normals, searched)
+        folded = np.einsum("ei,ei->e", normals[first], normals[second]) < np.cos(np.radians(FOLD_DEG))
+        marked[first[folded]] = marked[second[folded]] = True
         return marked
 
     def updated(
@@ -89,48 +92,45 @@ class DefectFinder:
         touched = (before != vertices).any(1)[self._faces].any(1)
         if not touched.any():
             return marked
-        # two faces that did not move may still cross, so what is near is searched again
-        places = np.concatenate([before[self._faces[touched]], vertices[self._faces[touched]]]).reshape(-1, 3)
         low, high = _boxes(vertices, self._faces)
-        near = ((low <= places.max(0)) & (high >= places.min(0))).all(1)
-        near |= faces_to_vertices(touched, self._faces, len(vertices))[self._faces].any(1)
-        return np.where(near, self.defective(vertices, near), marked)
+        places = np.concatenate([before[self._faces[touched]], vertices[self._faces[touched]]]).reshape(-1, 3)
+        here = ((low <= places.max(0)) & (high >= places.min(0))).all(1)
+        # other faces that crossed one that moved may cross a third one, too
+        near = faces_to_vertices(touched, self._faces, len(vertices))[self._faces].any(1) | (marked & here)
+        return self.defective(vertices, near) | (marked & ~near)
 
     def flipped(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
         """Mark faces that point against the local rotation of the surface; none without a rest shape."""
-        return self._flipped(vertices, unit_normals(vertices, self._faces))
+        searched = np.ones(len(self._faces), np.bool_)
+        return self._flipped(vertices, unit_normals(vertices, self._faces), searched)
 
     def count(self, vertices: Float[np.ndarray, "v 3"]) -> SurfaceDefects:
         """Count the defects of a pose."""
         normals = unit_normals(vertices, self._faces)
-        angles = np.degrees(np.arccos(self._cosines(normals).clip(-1, 1)))
+        cosines = np.einsum("ei,ei->e", normals[self._first], normals[self._second])
+        angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
         return SurfaceDefects(
             faces=len(self._faces),
             self_intersecting=int(self_intersecting(vertices, self._faces).sum()),
-            flipped=int(self._flipped(vertices, normals).sum()),
+            flipped=int(self.flipped(vertices).sum()),
             folds=int((angles > FOLD_DEG).sum()),
             creases=int((angles > CREASE_DEG).sum()),
             normal_deviation_deg=float(np.sqrt(np.mean(np.square(angles)))) if len(angles) else 0.0,
         )
 
-    def _cosines(self, normals: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " e"]:
-        """Return the cosine between the normals of the two faces of every inner edge."""
-        return np.einsum("ei,ei->e", normals[self._first], normals[self._second])
-
     def _flipped(
         self,
         vertices: Float[np.ndarray, "v 3"],
         normals: Float[np.ndarray, "f 3"],
-        near: Bool[np.ndarray, " f"] | None = None,
+        searched: Bool[np.ndarray, " f"],
     ) -> Bool[np.ndarray, " f"]:
-        """Mark faces, of those near, whose normal points against the rotation that fits the neighborhood best.
+        """Mark searched faces whose normal points against the rotation that fits the neighborhood best.
 
         The neighborhood of a face are the edges at its three corners; the rotation is that of Kabsch.
         """
         marked = np.zeros(len(self._faces), np.bool_)
         if self._rest is None:
             return marked
-        searched = np.ones_like(marked) if near is None else near
         corners = faces_to_vertices(searched, self._faces, len(vertices))
         poses = (np.asarray(pose, np.float64) for pose in (vertices, self._rest))
         _mark_flipped(*poses, self._faces, normals, self._normals_at_rest, searched, corners, marked)
@@ -177,7 +177,7 @@ def unit_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
 
 def area_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Return the normals of the faces, of twice their area as length."""
-    a, b, c = np.moveaxis(vertices.astype(np.float64)[faces], 1, 0)
+    a, b, c = (vertices[corner].astype(np.float64) for corner in faces.T)
     return np.cross(b - a, c - a)
 
 
@@ -227,7 +227,7 @@ def _crossing(
     first = ((low - low.min(0)) / cell).astype(np.int64)
     last = ((high - low.min(0)) / cell).astype(np.int64)
     shape = last.max(0) + 1
-    starts, members = _fill_grid(first, last, shape)
+    starts, members = _fill_grid(first, last, shape, searched)
     points, corners = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, searched, marked)
     return marked
@@ -260,9 +260,23 @@ def _mark_flipped(vertices, rest, faces, normals, normals_at_rest, searched, cor
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _fill_grid(first, last, shape):
-    """List the faces of every cell that their bounding boxes touch, as offsets and members."""
-    counts = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
+def _searched_cells(first, last, shape, searched):
+    """Mark the cells that the bounding boxes of searched faces touch."""
+    wanted = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
+    for face in np.flatnonzero(searched):
+        for x in range(first[face, 0], last[face, 0] + 1):
+            for y in range(first[face, 1], last[face, 1] + 1):
+                start = (x * shape[1] + y) * shape[2]
+                wanted[start + first[face, 2] : start + last[face, 2] + 1] = True
+    return wanted
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _fill_grid(first, last, shape, searched):
+    """List the faces of every cell that the bounding box of a searched face touches, as offsets and members."""
+    wanted = _searched_cells(first, last, shape, searched)
+    counts = np.zeros(len(wanted) + 1, np.int64)
     for fill in range(2):
         if fill:
             starts = np.cumsum(counts)
@@ -275,6 +289,8 @@ def _fill_grid(first, last, shape):
                 for y in range(first[face, 1], last[face, 1] + 1):
                     for z in range(first[face, 2], last[face, 2] + 1):
                         cell = (x * shape[1] + y) * shape[2] + z
+                        if not wanted[cell]:
+                            continue
                         if fill:
                             members[places[cell]] = face
                             places[cell] += 1

@@ -65,3 +65,8 @@ def silhouette_iou(
 def cameras_of(frames: int) -> list[list[OrbitCamera]]:
     """Return the camera of every frame, for each view."""
     return [[OrbitCamera(0, azimuth, width=SIZE, height=SIZE)] * frames for azimuth, _ in VIEWS]
+
+
+def enlarged_masks(alpha: Float[Tensor, "t h w"], size: int) -> Bool[Tensor, "t s s"]:
+    """Return the masks of a subject at another size, pixels."""
+    return interpolate(alpha[:, None], (size, size), mode="bicubic")[:, 0] > ALPHA_THRESHOLD

@@ -27,20 +27,19 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     edges = edge_graph(faces, len(vertices))
     mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
-    fewest, best = len(faces) + 1, smooth
-    moved: Bool[np.ndarray, " v"] | None = None  # outside of it, nothing was ever wrong
-    for number in range(ROUNDS):
-        defective = finder.defective(smooth, None if moved is None else moved[faces].any(1))
-        if defective.sum() < fewest:
-            fewest, best = defective.sum(), smooth.copy()
+    defective = finder.defective(smooth)
+    fewest, best = defective.sum(), smooth
+    for number in range(ROUNDS - 1):
         if fewest == 0:
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
-        moved = around if moved is None else moved | around
-        here = np.flatnonzero(around)
-        means_here = mean_of_neighbors[here]
+        here, before = np.flatnonzero(around), smooth
+        means_here, smooth = mean_of_neighbors[here], smooth.copy()
         for _ in range(SWEEPS):
             smooth[here] += STEP * (means_here @ smooth - smooth[here])
+        defective = finder.updated(defective, before, smooth)
+        if defective.sum() < fewest:
+            fewest, best = defective.sum(), smooth
     return best.astype(vertices.dtype)
 
 

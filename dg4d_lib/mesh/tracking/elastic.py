@@ -30,6 +30,7 @@ from dg4d_lib.mesh.neighbors import (
     grown,
     screened_factors,
 )
+from dg4d_lib.mesh.screened import solve_screened
 
 Vertices = Float64[np.ndarray, "v 3"]
 
@@ -228,17 +229,19 @@ class ElasticBody:
         moved, forces = start.copy(), np.empty_like(start)
         rotations = np.empty((len(start), 3, 3))
         rows = near = np.arange(len(start))
-        if free is None:
-            solve = (self._whole if (pull == PULL).all() else screened_factors(self.laplacian, pull)).solve
-        else:
+        alike = free is None and bool((pull == PULL).all())
+        if free is not None:
             rows, near = np.flatnonzero(free), np.flatnonzero(grown(free, self.edges, 1))
-            solve = screened_factors(self.laplacian[rows][:, rows], pull[rows]).solve
+            factors = screened_factors(self.laplacian[rows][:, rows], pull[rows])
             held = self.laplacian[rows][:, ~free] @ start[~free]
         for _ in range(passes):
             _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, near, rotations)
             _forces(self.edges.indptr, self.edges.indices, self.rest, rotations, rows, forces)
             wanted = forces[rows] + pull[rows, None] * tracked[rows]
-            moved[rows] = solve(wanted if free is None else wanted - held)
+            if free is not None:
+                moved[rows] = factors.solve(wanted - held)
+            else:
+                moved = self._whole.solve(wanted) if alike else solve_screened(self.edges, pull, wanted, moved)
         return moved
 
 

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import enlarged_masks
 from dg4d_lib.mesh.extraction.unfold import without_new_defects
-from dg4d_lib.mesh.neighbors import screened_factors
+from dg4d_lib.mesh.screened import solve_screened
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
-from dg4d_lib.mesh.tracking.outline_registration import enlarged_masks, outline_of, outline_steps
+from dg4d_lib.mesh.tracking.outline_registration import outline_of, outline_steps
 
 SIZE = 1024  # pixels of the compared outlines
 ROUNDS = 5
@@ -51,7 +52,7 @@ def fit_outline_detail(
         for _ in range(ROUNDS):
             steps, share = outline_steps(torch.from_numpy(moved).float(), faces, target, camera, LONGEST)
             pull = PULL * share
-            moved = moved + screened_factors(body.laplacian, pull + STAY).solve(pull[:, None] * steps)
+            moved = moved + solve_screened(body.edges, pull + STAY, pull[:, None] * steps, steps)
         kept = without_new_defects(start, moved, body.faces, body.edges, body.defective)
         fitted[frame] = torch.from_numpy(kept - body.rest).to(offsets)
 

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, enlarged_masks
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.fairing import LowPass, bump_filter
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
@@ -72,11 +71,6 @@ def outline_of(mask: Bool[np.ndarray, "h w"]) -> Outline:
     rows, columns = rows + top, columns + left
     points = np.concatenate([np.stack([columns, rows], 1) + 0.5, FACING * normals], 1)
     return Outline(points.astype(np.float64), (rows, columns))
-
-
-def enlarged_masks(alpha: Float[Tensor, "t h w"], size: int) -> Bool[Tensor, "t s s"]:
-    """Return the masks of a subject at another size, pixels."""
-    return functional.interpolate(alpha[:, None], (size, size), mode="bicubic")[:, 0] > ALPHA_THRESHOLD
 
 
 def _cropped(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[int, int, Bool[np.ndarray, "i j"]]:
