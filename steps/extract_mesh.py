@@ -28,7 +28,7 @@ from dg4d_lib.mesh.extraction.clean import clean
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, usable_level
 from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
-from dg4d_lib.mesh.extraction.strands import grow_strands
+from dg4d_lib.mesh.extraction.strands import Tube, with_strands
 from dg4d_lib.mesh.extraction.topology import MeshTopology, check_topology, weld_vertices
 from dg4d_lib.mesh.extraction.tunnels import fill_tunnels
 from dg4d_lib.mesh.extraction.unfold import unfold
@@ -42,6 +42,7 @@ from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.color_registration import register_to_colors
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
+from dg4d_lib.mesh.tracking.moving_strands import find_strands_again, grow_moving_strands
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.outline_detail import fit_outline_detail
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
@@ -128,7 +129,7 @@ def run(job: Job) -> StepReport:
         if settings.source == "prior" and video and "subject" in job.inputs:
             guesses = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
             weights = packaged.digests()
-        rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses, video)
+        rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses)
         if video and plan.guide == "video":
             tracked, ious, notes = _guided(job, rest_shape, states, video, plan, rasterize, settings)
         else:
@@ -179,7 +180,7 @@ def textured_mesh(
     vertices, faces = _isosurface(gaussians, level, rasterize, settings)
     if frame is not None:
         alpha = frame[1][..., 0]
-        vertices, faces = grow_strands(vertices, faces, alpha)
+        vertices, faces = with_strands(vertices, faces, alpha)
         vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha[None])[0]
     shown = _shown(vertices, faces, frame)
     mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
@@ -203,10 +204,9 @@ def _rest_shape(
     rasterize: Rasterizer,
     settings: MeshSettings,
     guesses: SubjectShapes | None,
-    video: DrivingVideo | None,
     frame: int,
 ) -> RestShape:
-    """Return the guess of a frame, or without guesses the isosurface of the Gaussians, with strands of the video."""
+    """Return the guess of a frame, or without guesses the isosurface of the Gaussians."""
     gaussians = states.at(frame)
     if guesses is None:
         vertices, faces = _isosurface(gaussians, level, rasterize, settings)
@@ -216,8 +216,6 @@ def _rest_shape(
         rough = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
         vertices, faces = _faired(*rough, settings)
         draw = partial(render_surface, guess)
-    if video is not None:
-        vertices, faces = grow_strands(vertices, faces, video.alpha[frame, ..., 0])
     return RestShape(vertices, faces, gaussians, draw)
 
 
@@ -243,8 +241,12 @@ def _tracked(
         relaxed = relax(vertices, registered, faces, silhouettes)
         mesh, sources = coloring.result()
     if video is not None:
+        alpha = video.alpha[..., 0]
+        vertices, relaxed, faces, strands = grow_moving_strands(vertices, relaxed, faces, alpha, frame)
+        if strands:
+            mesh, sources = _colored(vertices, faces, rest.draw, settings, _shown(vertices, faces, _at(video, frame)))
         textured = partial(_fitted, faces=faces, sources=sources, video=video)
-        mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video)
+        mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video, strands)
     offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     if video is not None:
@@ -283,6 +285,8 @@ def _guided(
     offsets = register_tracking(
         vertices, best.offsets, faces, states, video, best.frame, level, rasterize, settings
     )  # fmt: skip
+    alpha = video.alpha[..., 0]
+    vertices, offsets, faces, strands = grow_moving_strands(vertices, offsets, faces, alpha, best.frame)
     mesh, sources = _colored(
         vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
     )  # fmt: skip
@@ -291,8 +295,8 @@ def _guided(
     textured = partial(
         _baked, faces=faces, sources=sources, video=video, normals=normals, draw=draw, settings=settings
     )  # fmt: skip
-    mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video)
-    silhouettes = render_silhouettes(states, range(len(refined)), rasterize, video.alpha[..., 0])
+    mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video, strands)
+    silhouettes = render_silhouettes(states, range(len(refined)), rasterize, alpha)
     refined, separated = _sound(vertices, refined, faces, silhouettes, video)
     moved = vertices + refined
     tracked = TrackedMesh(textured(mesh, moved), refined[:, sources], reference_frame=best.frame)
@@ -342,11 +346,13 @@ def _registered(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     video: DrivingVideo,
+    strands: tuple[Tube, ...],
 ) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
     """Return the mesh with a texture from the video, and offsets that agree with the video's colors and outlines."""
     mesh, pictures = textured(mesh, vertices + offsets), video.over(video.frames.new_ones(3))
     offsets = register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
-    return mesh, fit_outline_detail(vertices, offsets, faces, video.alpha[..., 0])
+    offsets = fit_outline_detail(vertices, offsets, faces, video.alpha[..., 0])
+    return mesh, find_strands_again(vertices, offsets, faces, strands, video.alpha[..., 0])
 
 
 def _fitted(

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from skimage.morphology import skeletonize
 from torch import Tensor
@@ -25,13 +25,15 @@ SIZE = 1024  # pixels of the compared masks
 NEAR = 6.0  # pixels by which the outline of the surface may be wrong without a strand
 THICKEST = 8.0  # pixels from the middle of a strand to its side
 SHORTEST = 24.0  # pixels of a strand beyond the outline of the surface
+GAP = 8.0  # pixels of a strand that may be lost, where it is thinner than a pixel of the picture
 SLENDER = 4.0  # length of a strand, in its radii, at least
+MARGIN = 16  # pixels around what is not covered
 REACH = 48.0  # pixels from the root of a strand to the vertex that it grows out of
 ROUNDS = 4  # branches of a strand grow in the round after it
 SMOOTH = 4.0  # standard deviation of the middle line along its pixels
 THINNEST = 2.0  # pixels of radius
 TIP = 6  # pixels of the middle line that show where it goes on
-ATTEMPTS = 4  # vertices that a strand may grow out of
+ATTEMPTS = 8  # vertices that a strand may grow out of
 
 
 class Strand(NamedTuple):
@@ -46,10 +48,38 @@ class Strand(NamedTuple):
     radii: Float64[np.ndarray, " p"]
 
 
-def grow_strands(
+class Tube(NamedTuple):
+    """Vertices of a strand on a surface.
+
+    Attributes:
+        root: the ring of vertices that it grew out of.
+        rings: of its own, from there to the tip.
+        tip: vertex at its end.
+    """
+
+    root: Int[np.ndarray, " n"]
+    rings: Int[np.ndarray, "k n"]
+    tip: int
+
+
+class Grown(NamedTuple):
+    """Surface with strands.
+
+    Attributes:
+        vertices: those of the surface without strands come first, some of which became tips.
+        faces: counter-clockwise seen from outside.
+        tubes: the strands; some grow out of others before them.
+    """
+
+    vertices: Float64[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    tubes: tuple[Tube, ...] = ()
+
+
+def with_strands(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], alpha: Float[Tensor, "i j"]
 ) -> tuple[Float[Tensor, "w 3"], Int[Tensor, "g 3"]]:
-    """Return the surface with the strands that the picture shows beyond its outline.
+    """Return a surface with the strands that a picture shows beyond its outline.
 
     Args:
         vertices: welded, world units.
@@ -57,60 +87,104 @@ def grow_strands(
         alpha: of the subject at the input view.
     """
     mask = enlarged_masks(alpha[None], SIZE)[0].numpy()
-    grown, corners = vertices.double().numpy(), faces.numpy().astype(np.int64)
-    taken = np.zeros(len(grown), bool)
+    grown = grow_strands(vertices.double().numpy(), faces.numpy(), mask)
+    return torch.from_numpy(grown.vertices).to(vertices), torch.from_numpy(grown.faces).to(faces)
+
+
+def grow_strands(
+    vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], mask: Bool[np.ndarray, "h w"]
+) -> Grown:
+    """Return a surface with the strands that a mask at the input view shows beyond its outline.
+
+    Args:
+        vertices: welded, world units.
+        faces: counter-clockwise seen from outside.
+        mask: of the subject, `SIZE` pixels.
+    """
+    grown = Grown(vertices, faces)
+    taken = np.zeros(len(vertices), bool)
     for _ in range(ROUNDS):
-        strands = _strands(mask, _covered(grown, corners))
-        before = len(grown)
-        for strand in strands:
-            larger = _with_strand(grown, corners, strand, taken)
+        before = len(grown.tubes)
+        for strand in find_strands(mask, covered_pixels(grown.vertices, grown.faces)):
+            larger = with_strand(grown, strand, taken)
             if larger is not None:
-                grown, corners, taken = larger
-        if len(grown) == before:
+                grown = larger
+                fresh = np.zeros(len(grown.vertices) - len(taken), bool)
+                taken = np.concatenate([taken, fresh])
+                taken[[grown.tubes[-1].tip, *grown.tubes[-1].root]] = True
+        if len(grown.tubes) == before:
             break
-    return torch.from_numpy(grown).to(vertices), torch.from_numpy(corners).to(faces)
+    return grown
 
 
-def _covered(vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, "h w"]:
+def covered_pixels(vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, "h w"]:
+    """Mark the pixels of the input view that a surface covers, of `SIZE` by `SIZE`."""
     camera = OrbitCamera(width=SIZE, height=SIZE)
     fragments = rasterize_mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces), [camera])
     covered: Bool[np.ndarray, "h w"] = (fragments.faces[0] >= 0).numpy()
     return covered
 
 
-def _strands(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> list[Strand]:
+def find_strands(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> list[Strand]:
     """Return the longest strand of every part of the mask that is not covered."""
-    beyond = ndimage.distance_transform_edt(~covered)
-    radius = ndimage.distance_transform_edt(mask)
-    labels, count = ndimage.label(skeletonize(mask) & (beyond > NEAR), np.ones((3, 3)))
+    lines, beyond, radius, corner = middle_lines(mask, covered)
+    pixels = np.stack(np.nonzero(lines), 1)
+    pairs = cKDTree(pixels).query_pairs(GAP, output_type="ndarray") if len(pixels) else np.zeros((0, 2), np.int64)
+    gaps = np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
+    tree = minimum_spanning_tree(coo_array((gaps, tuple(pairs.T)), shape=(len(pixels), len(pixels))).tocsr())
+    parts = connected_components(tree, directed=False)[1]
     strands = []
-    for label in range(1, count + 1):
-        pixels = np.stack(np.nonzero(labels == label), 1)
-        path = _longest_path(pixels, beyond[tuple(pixels.T)])
+    for part in np.unique(parts):
+        here = np.flatnonzero(parts == part)
+        path = pixels[_longest_path(tree, int(here[beyond[tuple(pixels[here].T)].argmin()]))]
         radii = radius[tuple(path.T)]
-        length = len(path)
-        if length >= max(SHORTEST, SLENDER * radii.mean()) and np.median(radii) <= THICKEST:
-            points = ndimage.gaussian_filter1d(path[:, ::-1] + 0.5, SMOOTH, axis=0, mode="nearest")
+        if len(path) >= max(SHORTEST, SLENDER * radii.mean()) and np.median(radii) <= THICKEST:
+            points = ndimage.gaussian_filter1d(path[:, ::-1] + corner + 0.5, SMOOTH, axis=0, mode="nearest")
             strands.append(Strand(points, ndimage.gaussian_filter1d(radii, SMOOTH, mode="nearest").clip(THINNEST)))
     return strands
 
 
-def _longest_path(pixels: Int[np.ndarray, "p 2"], beyond: Float[np.ndarray, " p"]) -> Int[np.ndarray, "q 2"]:
-    """Return the pixels from the one nearest to the surface to that farthest from it along the others."""
-    pairs = cKDTree(pixels).query_pairs(1.5, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(pixels), len(pixels))).tocsr()
-    order, before = breadth_first_order(links, int(beyond.argmin()), directed=False)
+def middle_lines(
+    mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]
+) -> tuple[Bool[np.ndarray, "i j"], Float[np.ndarray, "i j"], Float[np.ndarray, "i j"], Int[np.ndarray, " 2"]]:
+    """Mark the middle lines of the parts of a mask that are not covered.
+
+    Returns:
+        The marks around what is not covered; the distances of these pixels from covered ones and from the outside of
+        the mask; and column and row of the first of them.
+    """
+    whole = _around(mask, 1)
+    beyond = ndimage.distance_transform_edt(~covered[whole]) if covered.any() else np.full(mask[whole].shape, np.inf)
+    uncovered = mask[whole] & (beyond > NEAR)
+    part = _around(uncovered, MARGIN)
+    beyond, here = beyond[part], mask[whole][part]
+    lines = skeletonize(here) & (beyond > NEAR)
+    radius = ndimage.distance_transform_edt(here)
+    return lines, beyond, radius, np.array([whole[1].start + part[1].start, whole[0].start + part[0].start])
+
+
+def _around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a mask, and some more; none if it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    if len(rows) == 0:
+        return slice(0, 0), slice(0, 0)
+    down, across = (slice(max(0, at[0] - margin), at[-1] + 1 + margin) for at in (rows, columns))
+    return down, across
+
+
+def _longest_path(tree: csr_array, root: int) -> list[int]:
+    """Return the nodes from the root of a tree to the one that is most steps away."""
+    order, before = breadth_first_order(tree, root, directed=False)
     at, path = int(order[-1]), []
     while at >= 0:
         path.append(at)
         at = int(before[at])
-    return pixels[path[::-1]]
+    return path[::-1]
 
 
-def _with_strand(
-    vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], strand: Strand, taken: Bool[np.ndarray, " v"]
-) -> tuple[Float64[np.ndarray, "w 3"], Int[np.ndarray, "g 3"], Bool[np.ndarray, " w"]] | None:
-    """Return the surface with a tube, and its vertices that others may not grow out of; None if none is sound."""
+def with_strand(grown: Grown, strand: Strand, taken: Bool[np.ndarray, " v"]) -> Grown | None:
+    """Return the surface with a tube, out of a vertex that is not taken; None if no attempt is sound."""
+    vertices, faces = grown.vertices, grown.faces
     camera = OrbitCamera(width=SIZE, height=SIZE)
     view = camera.viewmat().numpy()
     in_camera = vertices @ view[:3, :3].T + view[:3, 3]
@@ -118,23 +192,17 @@ def _with_strand(
     distances = np.linalg.norm(pixels - strand.points[0], axis=1) + np.where(taken, np.inf, 0)
     sound = ~DefectFinder(faces).defective(vertices)
     for base in np.argsort(distances)[:ATTEMPTS]:
-        if distances[base] > REACH:
-            break
+        root = _ring(faces, int(base))
+        if distances[base] > REACH or root is None or taken[root].any():
+            continue
         depth = in_camera[base, 2]
         flat = (strand.points - SIZE / 2) * depth / camera.focal
         path = (np.concatenate([flat, np.full((len(flat), 1), depth)], 1) - view[:3, 3]) @ view[:3, :3]
-        around = _ring(faces, int(base))
-        if around is None or taken[around].any():
-            continue
-        spacing = np.linalg.norm(vertices[around] - vertices[base], axis=1).mean()
-        tube = _tube(vertices, faces, int(base), around, path, strand.radii * depth / camera.focal, spacing)
-        bad = DefectFinder(tube[1]).defective(tube[0])
+        larger = _with_tube(grown, int(base), root, path, strand.radii * depth / camera.focal)
         kept = (faces != base).all(1)  # they come first
-        if (bad[: kept.sum()] & sound[kept]).any() or bad[kept.sum() :].any():
-            continue
-        marked = np.concatenate([taken, np.zeros(len(tube[0]) - len(taken), bool)])
-        marked[[base, *around]] = True
-        return *tube, marked
+        bad = DefectFinder(larger.faces).defective(larger.vertices)
+        if not (bad[: kept.sum()] & sound[kept]).any() and not bad[kept.sum() :].any():
+            return larger
     return None
 
 
@@ -151,41 +219,38 @@ def _ring(faces: Int[np.ndarray, "f 3"], base: int) -> Int[np.ndarray, " n"] | N
     return np.array(ring) if whole else None
 
 
-def _tube(
-    vertices: Float64[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
+def _with_tube(
+    grown: Grown,
     base: int,
-    around: Int[np.ndarray, " n"],
+    root: Int[np.ndarray, " n"],
     path: Float64[np.ndarray, "p 3"],
     radii: Float64[np.ndarray, " p"],
-    spacing: float,
-) -> tuple[Float64[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+) -> Grown:
     """Return the surface with a tube in place of the faces at a vertex, which becomes the tip."""
-    tip = path[-1] - path[-1 - TIP :][:1]  # a middle line ends before it
+    vertices, faces = grown.vertices, grown.faces
+    tip = path[-1] - path[-1 - TIP :][0]  # a middle line ends before it
     path = np.concatenate([path, path[-1:] + tip / max(np.linalg.norm(tip), 1e-12) * radii[-1]])
-    radii = np.append(radii, radii[-1])
     along = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+    spacing = np.linalg.norm(vertices[root] - vertices[base], axis=1).mean()
     places = np.linspace(0, along[-1], max(2, round(along[-1] / spacing)) + 1)
     centers = np.stack([np.interp(places, along, path[:, axis]) for axis in range(3)], 1)
-    widths = np.interp(places, along, radii)
+    widths = np.interp(places, along, np.append(radii, radii[-1]))
     directions = np.gradient(np.concatenate([vertices[base, None], centers]), axis=0)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-12)
-    ring = vertices[around] - vertices[around].mean(0)
-    first = ring[0] - directions[0] * (ring[0] @ directions[0])
-    count, rings = len(around), []
-    angles = 2 * np.pi * np.arange(count) / count
+    across = vertices[root[0]] - vertices[root].mean(0)
+    count, rings = len(root), []
+    widths = widths * np.sqrt(2 * np.pi / (count * np.sin(2 * np.pi / count)))  # a polygon of the area of the circle
+    angles = 2 * np.pi * np.arange(count)[:, None] / count
     for center, width, direction in zip(centers[:-1], widths, directions[1:], strict=False):
-        first = first - direction * (first @ direction)
-        first /= np.linalg.norm(first).clip(1e-12)
-        second = np.cross(direction, first)
-        rings.append(center + width * (np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second))
-    moved = vertices.copy()
+        across = across - direction * (across @ direction)
+        across /= np.linalg.norm(across).clip(1e-12)
+        rings.append(center + width * (np.cos(angles) * across + np.sin(angles) * np.cross(direction, across)))
+    moved = np.concatenate([vertices, *rings])
     moved[base] = centers[-1]
-    numbers = np.concatenate([around[None], len(vertices) + np.arange(len(rings) * count).reshape(-1, count)])
-    low, high = numbers[:-1], numbers[1:]
+    own = len(vertices) + np.arange(len(rings) * count).reshape(-1, count)
+    low, high = np.concatenate([root[None], own[:-1]]), own
     low_next, high_next = np.roll(low, -1, 1), np.roll(high, -1, 1)
     sides = np.stack([np.stack([low, low_next, high_next], -1), np.stack([low, high_next, high], -1)])
-    last = numbers[-1]
-    cap = np.stack([last, np.roll(last, -1), np.full(count, base)], 1)
-    kept = faces[(faces != base).all(1)]
-    return np.concatenate([moved, *rings]), np.concatenate([kept, sides.reshape(-1, 3), cap]).astype(faces.dtype)
+    cap = np.stack([own[-1], np.roll(own[-1], -1), np.full(count, base)], 1)
+    corners = np.concatenate([faces[(faces != base).all(1)], sides.reshape(-1, 3), cap]).astype(faces.dtype)
+    return Grown(moved, corners, (*grown.tubes, Tube(root, own, base)))

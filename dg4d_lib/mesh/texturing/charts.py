@@ -211,7 +211,8 @@ class _Surface:
         """Return the linear texel density of chosen faces relative to the mean of their chart, and their areas."""
         corners = self.vertices[self.faces[chosen]]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-        return np.sqrt(flat_areas(charts.flat, charts.faces) / np.maximum(areas, np.finfo(float).tiny)), areas
+        flat = flat_areas(charts.flat, charts.faces).clip(0)  # negative where a face is mirrored
+        return np.sqrt(flat / np.maximum(areas, np.finfo(float).tiny)), areas
 
     def flattened(self, labels: Labels, chosen: Bool[np.ndarray, " f"] | None = None) -> Charts:
         """Flatten the charts of chosen faces, which must be disks."""

@@ -7,7 +7,7 @@ import trimesh
 from skimage.draw import line
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.extraction.strands import grow_strands
+from dg4d_lib.mesh.extraction.strands import with_strands
 from dg4d_lib.mesh.folds import genus, surface_defects
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -44,7 +44,7 @@ def test_lines_beyond_the_outline_become_tubes(
 ) -> None:
     vertices, faces = ball()
     alpha = torch.maximum(alpha_of(vertices, faces), lines(*ends))
-    grown, corners = grow_strands(vertices, faces, alpha)
+    grown, corners = with_strands(vertices, faces, alpha)
     beyond = (alpha > 0.5) & (alpha_of(vertices, faces) < 0.5)
     covered = alpha_of(grown, corners) > 0.5
     assert (covered & beyond).sum() > 0.7 * beyond.sum()  # the lines have steps
@@ -60,7 +60,7 @@ def test_lines_beyond_the_outline_become_tubes(
 
 def test_tubes_are_as_thick_as_the_lines() -> None:
     vertices, faces = ball()
-    grown, _ = grow_strands(vertices, faces, torch.maximum(alpha_of(vertices, faces), lines(LEG)))
+    grown, _ = with_strands(vertices, faces, torch.maximum(alpha_of(vertices, faces), lines(LEG)))
     depth, pixel = 2 - float(grown[len(vertices) :, 2].mean()), 1 / OrbitCamera(width=SIZE, height=SIZE).focal
     thick = float(np.ptp(grown[len(vertices) :, 2].numpy()))
     assert thick == pytest.approx(2 * depth * pixel, rel=0.35)
@@ -71,16 +71,16 @@ def test_a_subject_without_strands_stays() -> None:
     wider = alpha_of(1.06 * vertices, faces)
     lobe = alpha_of(0.3 * vertices + torch.tensor([0.4, 0.2, 0.0]), faces)
     for alpha in (alpha_of(vertices, faces), wider, torch.maximum(wider, lobe)):
-        grown, corners = grow_strands(vertices, faces, alpha)
+        grown, corners = with_strands(vertices, faces, alpha)
         assert torch.equal(grown, vertices) and torch.equal(corners, faces)
 
 
 def test_lines_apart_from_the_subject_are_no_strands() -> None:
     vertices, faces = ball()
     alpha = torch.maximum(alpha_of(vertices, faces), lines(((20, 20), (20, 90)), ((235, 120), (235, 121))))
-    assert torch.equal(grow_strands(vertices, faces, alpha)[0], vertices)
+    assert torch.equal(with_strands(vertices, faces, alpha)[0], vertices)
 
 
 def test_an_empty_picture_grows_nothing() -> None:
     vertices, faces = ball()
-    assert torch.equal(grow_strands(vertices, faces, torch.zeros(SIZE, SIZE))[0], vertices)
+    assert torch.equal(with_strands(vertices, faces, torch.zeros(SIZE, SIZE))[0], vertices)

@@ -1,0 +1,295 @@
+"""Strands of a mesh that moves: they grow where a frame shows them best, and are found again in the others.
+
+Tracking loses what is a pixel wide, so the mesh is tracked without strands. In every frame, a strand is shifted by the
+surface around its root first, and then turns, stretches and bends to the middle lines that the picture shows there.
+A strand that most frames do not show is none: seen from the side, wings and hands are lines, too.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import enlarged_masks
+from dg4d_lib.mesh.extraction.strands import (
+    NEAR,
+    SIZE,
+    THICKEST,
+    Grown,
+    Strand,
+    Tube,
+    covered_pixels,
+    find_strands,
+    middle_lines,
+    with_strand,
+)
+from dg4d_lib.mesh.neighbors import edge_graph, grown
+
+TRIED = 40  # strands of single frames, the longest first, at most
+NEW = 0.5  # share of the points of a strand that must not belong to one before it
+RINGS = 4  # of vertices around the root of a strand that it goes with
+TURNS_DEG, SCALES = np.arange(-60.0, 61, 5), np.arange(0.7, 1.31, 0.1)  # that are tried about the root
+FAR = 24.0  # pixels from a middle line that count as lost
+EFFORT = 4.0  # pixels that a turn by 60 degrees, or half of the length, must gain
+LOST = 3.0  # mean distance from middle lines, pixels, above which a frame does not show the strand
+SHOWN = 0.4  # share of its points that the surface must not cover there
+SEEN = 0.5  # share of the frames that must show it
+STIFF = (3.0, 3.0, 2.0, 2.0, 1.0, 1.0)  # standard deviation of the steps of bending along the rings, by rounds
+USED = 8.0  # pixels around a strand whose middle lines no other one takes
+
+Vertices = Float64[np.ndarray, "v 3"]
+Poses = Float64[np.ndarray, "p v 3"]  # of the frames, and of the rest shape
+CAMERA = OrbitCamera(width=SIZE, height=SIZE)
+
+
+class Fit(NamedTuple):
+    """Where a frame shows a strand.
+
+    Attributes:
+        line: column and row of its points; None if it is not shown.
+        turn: about its root, from where the surface carries it, radians.
+        scale: of its length.
+    """
+
+    line: Float64[np.ndarray, "k 2"] | None
+    turn: float
+    scale: float
+
+
+def grow_moving_strands(
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    alpha: Float[Tensor, "t i j"],
+    reference_frame: int,
+) -> tuple[Float[Tensor, "w 3"], Float[Tensor, "t w 3"], Int[Tensor, "g 3"], tuple[Tube, ...]]:
+    """Return the mesh and its offsets with the strands that the video shows beyond its outlines, and the strands.
+
+    Args:
+        vertices: in the reference frame, welded, world units.
+        offsets: of the vertices at every frame.
+        faces: counter-clockwise seen from outside.
+        alpha: of the video, at the input view.
+        reference_frame: in which the surface is best; strands grow there first.
+    """
+    poses = torch.cat([vertices + offsets, vertices[None]]).double().numpy()
+    corners, covered = faces.numpy(), np.zeros((len(alpha), SIZE, SIZE), bool)
+    targets, candidates = [np.zeros((0, 2))] * len(alpha), list[tuple[int, Strand]]()
+
+    def look(frame: int) -> None:
+        mask = _mask(alpha[frame])
+        covered[frame] = covered_pixels(poses[frame], corners)
+        targets[frame] = _targets(mask, covered[frame])
+        candidates.extend((frame, strand) for strand in find_strands(mask, covered[frame]))
+
+    run_parallel([partial(look, frame) for frame in range(len(alpha))])
+    candidates.sort(key=lambda one: (one[0] != reference_frame, -len(one[1].points), one[0]))
+    tubes: tuple[Tube, ...] = ()
+    taken, tries = np.zeros(len(vertices), bool), 0
+    for frame, strand in candidates:
+        if tries == TRIED:
+            break
+        if len(targets[frame]) == 0 or _near(strand.points, targets[frame], USED / 2).mean() < NEW:
+            continue
+        tries += 1
+        larger = with_strand(Grown(poses[frame], corners, tubes), strand, taken)
+        if larger is None:
+            continue
+        moved, lines, shown = _followed(larger, poses, targets, covered)
+        if shown < SEEN:
+            continue
+        moved[frame] = larger.vertices
+        poses, corners, tubes = moved, larger.faces, larger.tubes
+        taken = np.append(taken, np.zeros(len(larger.vertices) - len(taken), bool))
+        taken[[tubes[-1].tip, *tubes[-1].root]] = True
+        for other, line in enumerate(lines):
+            if len(targets[other]):
+                targets[other] = targets[other][~_near(targets[other], line, USED)]
+    if not tubes:
+        return vertices, offsets, faces, ()
+    together = torch.from_numpy(poses).to(vertices)
+    return together[-1], together[:-1] - together[-1], torch.from_numpy(corners).to(faces), tubes
+
+
+def find_strands_again(
+    vertices: Float[Tensor, "v 3"],
+    offsets: Float[Tensor, "t v 3"],
+    faces: Int[Tensor, "f 3"],
+    tubes: Sequence[Tube],
+    alpha: Float[Tensor, "t i j"],
+) -> Float[Tensor, "t v 3"]:
+    """Return the offsets with strands where the video shows them, for a surface that has moved since they grew.
+
+    Args:
+        vertices: in the reference frame, welded, world units.
+        offsets: of the vertices at every frame.
+        faces: counter-clockwise seen from outside.
+        tubes: strands of the mesh.
+        alpha: of the video, at the input view.
+    """
+    if not tubes:
+        return offsets
+    found, strands = offsets.clone(), np.zeros(len(vertices), bool)
+    for tube in tubes:
+        strands[[*tube.rings.ravel(), tube.tip]] = True
+    body = faces.numpy()[~strands[faces.numpy()].any(1)]
+
+    def find(frame: int) -> None:
+        pose = (vertices + offsets[frame]).double().numpy()
+        covered = covered_pixels(pose, body)
+        targets = _targets(_mask(alpha[frame]), covered)
+        for tube in tubes:
+            line, root = _line(pose, tube)
+            fit = _fitted(line, root, targets, covered)
+            if fit.line is not None:
+                _move(pose, tube, fit.line - line)
+                targets = targets[~_near(targets, fit.line, USED)]
+        found[frame] = torch.from_numpy(pose).to(offsets) - vertices
+
+    run_parallel([partial(find, frame) for frame in range(len(offsets))])
+    return found
+
+
+def _mask(alpha: Float[Tensor, "i j"]) -> Bool[np.ndarray, "h w"]:
+    mask: Bool[np.ndarray, "h w"] = enlarged_masks(alpha[None], SIZE)[0].numpy(force=True)
+    return mask
+
+
+def _targets(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "p 2"]:
+    """Return column and row of the pixels of middle lines that may be strands."""
+    lines, _, radius, corner = middle_lines(mask, covered)
+    targets: Float64[np.ndarray, "p 2"] = np.stack(np.nonzero(lines & (radius <= THICKEST)), 1)[:, ::-1] + corner + 0.5
+    return targets
+
+
+def _near(
+    points: Float64[np.ndarray, "p 2"], others: Float64[np.ndarray, "q 2"], distance: float
+) -> Bool[np.ndarray, " p"]:
+    """Mark the points that are near one of the others."""
+    return np.asarray(cKDTree(others).query(points)[0]) < distance
+
+
+def _followed(
+    larger: Grown,
+    poses: Poses,
+    targets: list[Float64[np.ndarray, "_ 2"]],
+    covered: Bool[np.ndarray, "t h w"],
+) -> tuple[Float64[np.ndarray, "p n 3"], list[Float64[np.ndarray, "k 2"]], float]:
+    """Return all poses with the last strand of a surface, its lines in the frames, and the share that shows them."""
+    tube = larger.tubes[-1]
+    own = np.append(tube.rings.ravel(), tube.tip)
+    near = np.zeros(len(larger.vertices), bool)
+    near[tube.root] = True
+    near = grown(near, edge_graph(larger.faces, len(near)), RINGS)
+    near[own] = False
+    moved = np.zeros((len(poses), *larger.vertices.shape))
+    moved[:, : poses.shape[1]] = poses
+    lines, fits = [np.zeros((0, 2))] * len(targets), [Fit(None, 0.0, 1.0)] * len(targets)
+
+    def carry(frame: int) -> None:
+        pose = moved[frame]
+        pose[own] = larger.vertices[own] + (pose[near] - larger.vertices[near]).mean(0)
+        if frame < len(targets):
+            lines[frame], root = _line(pose, tube)
+            fits[frame] = _fitted(lines[frame], root, targets[frame], covered[frame])
+
+    run_parallel([partial(carry, frame) for frame in range(len(moved))])
+    shown = np.flatnonzero([fit.line is not None for fit in fits])
+    if len(shown) == 0:
+        return moved, lines, 0.0
+    for frame, fit in enumerate(fits):
+        line, root = _line(moved[frame], tube)
+        turn, scale = (np.interp(frame, shown, [getattr(fits[k], name) for k in shown]) for name in ("turn", "scale"))
+        lines[frame] = _turned(line, root, np.array([turn]), np.array([scale]))[0] if fit.line is None else fit.line
+        _move(moved[frame], tube, lines[frame] - line)
+    return moved, lines, len(shown) / len(targets)
+
+
+def _line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:
+    """Return column and row of the middle line of a strand, and those of its root."""
+    centers = np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
+    return _pixels(centers)[0], _pixels(pose[tube.root].mean(0, keepdims=True))[0]
+
+
+def _move(pose: Vertices, tube: Tube, steps: Float64[np.ndarray, "k 2"]) -> None:
+    """Move the points of the middle line of a strand by pixels, parallel to the picture; its rings turn with it."""
+    centers = np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
+    after = centers + steps * _pixels(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
+    root = pose[tube.root].mean(0, keepdims=True)
+    turns = Rotation.concatenate(
+        [
+            Rotation.align_vectors(to[None], along[None])[0]
+            for along, to in zip(*(_directions(root, line) for line in (centers, after)), strict=True)
+        ]
+    )
+    for ring, center, new, turn in zip(tube.rings, centers, after, turns, strict=False):
+        pose[ring] = turn.apply(pose[ring] - center) + new
+    pose[tube.tip] = after[-1]
+
+
+def _directions(root: Float64[np.ndarray, "1 3"], line: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
+    """Return the directions of a line at its points, which begins at a root."""
+    directions: Float64[np.ndarray, "k 3"] = np.gradient(np.concatenate([root, line]), axis=0)[1:]
+    return directions
+
+
+def _pixels(points: Float64[np.ndarray, "k 3"]) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
+    """Return column and row of points, and their depth."""
+    view = CAMERA.viewmat().numpy()
+    in_camera = points @ view[:3, :3].T + view[:3, 3]
+    return in_camera[:, :2] / in_camera[:, 2:] * CAMERA.focal + SIZE / 2, in_camera[:, 2]
+
+
+def _turned(
+    line: Float64[np.ndarray, "k 2"],
+    root: Float64[np.ndarray, "1 2"],
+    turns: Float64[np.ndarray, " n"],
+    scales: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, "n k 2"]:
+    """Return a line, turned and scaled about its root."""
+    cosines, sines = scales * np.cos(turns), scales * np.sin(turns)
+    matrices = np.stack([np.stack([cosines, sines], -1), np.stack([-sines, cosines], -1)], 1)
+    turned: Float64[np.ndarray, "n k 2"] = (line - root) @ matrices + root
+    return turned
+
+
+def _fitted(
+    line: Float64[np.ndarray, "k 2"],
+    root: Float64[np.ndarray, "1 2"],
+    targets: Float64[np.ndarray, "p 2"],
+    covered: Bool[np.ndarray, "h w"],
+) -> Fit:
+    """Return a line, turned and scaled about its root and bent to the targets, if the frame shows it."""
+    if len(targets) == 0:
+        return Fit(None, 0.0, 1.0)
+    tree = cKDTree(targets)
+
+    def distances(points: Float64[np.ndarray, "*n 2"]) -> tuple[Float64[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
+        """Return the distances of points from middle lines, and mark those that the surface covers."""
+        columns, rows = np.moveaxis(points.astype(np.int64).clip(0, SIZE - 1), -1, 0)
+        near = np.asarray(tree.query(points, distance_upper_bound=FAR)[0]).clip(max=FAR)
+        return near, covered[rows, columns]
+
+    turns, scales = (grid.ravel() for grid in np.meshgrid(np.radians(TURNS_DEG), SCALES))
+    tried = _turned(line, root, turns, scales)
+    near, hidden = distances(tried)
+    costs = np.where(hidden, NEAR, near).mean(-1) + EFFORT * (np.abs(turns) / np.radians(60) + 2 * np.abs(scales - 1))
+    best = costs.argmin()
+    bent = tried[best]
+    for stiff in STIFF:
+        apart, nearest = map(np.asarray, tree.query(bent, distance_upper_bound=FAR))
+        steps = np.zeros_like(bent)
+        steps[apart < FAR] = targets[nearest[apart < FAR]] - bent[apart < FAR]
+        bent = bent + ndimage.gaussian_filter1d(steps, stiff, axis=0, mode="nearest")
+    near, hidden = distances(bent)
+    shown = (~hidden).mean() >= SHOWN and near[~hidden].mean() <= LOST
+    return Fit(bent if shown else None, float(turns[best]), float(scales[best]))
