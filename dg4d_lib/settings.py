@@ -431,7 +431,7 @@ class MeshSettings(Settings):
     fairing: float = Field(
         0.0, ge=0, le=1, description="world units; bumps of this wavelength lose half of their height"
     )
-    max_faces: int = Field(100000, ge=100, description="largest number of triangles of a mesh")
+    max_faces: int = Field(100000, ge=100, description="largest number of triangles, without those of strands")
     min_component: Share = Field(0.02, description="components with a smaller fraction of the faces are removed")
     unwrap: UnwrapMethod = Field(
         "charts", description="charts: even, none mirrored (ours); xatlas: in half the time, with more islands"

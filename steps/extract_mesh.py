@@ -240,18 +240,19 @@ def _tracked(
         registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
         relaxed = relax(vertices, registered, faces, silhouettes)
         mesh, sources = coloring.result()
+    strands: tuple[Tube, ...] = ()
     if video is not None:
         alpha = video.alpha[..., 0]
         vertices, relaxed, faces, strands = grow_moving_strands(vertices, relaxed, faces, alpha, frame)
         if strands:
             mesh, sources = _colored(vertices, faces, rest.draw, settings, _shown(vertices, faces, _at(video, frame)))
         textured = partial(_fitted, faces=faces, sources=sources, video=video)
-        mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video, strands)
-    offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video)
+        mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video)
+    offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video, strands)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     if video is not None:
         mesh = textured(mesh, vertices + offsets)
-    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *separated]
+    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *_note(strands), *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
 
@@ -295,12 +296,17 @@ def _guided(
     textured = partial(
         _baked, faces=faces, sources=sources, video=video, normals=normals, draw=draw, settings=settings
     )  # fmt: skip
-    mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video, strands)
+    mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, alpha)
-    refined, separated = _sound(vertices, refined, faces, silhouettes, video)
+    refined, separated = _sound(vertices, refined, faces, silhouettes, video, strands)
     moved = vertices + refined
     tracked = TrackedMesh(textured(mesh, moved), refined[:, sources], reference_frame=best.frame)
-    return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *separated]
+    return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *_note(strands), *separated]
+
+
+def _note(strands: tuple[Tube, ...]) -> list[str]:
+    """Tell how many strands a mesh has, if any."""
+    return [f"{len(strands)} strands of the video that were too thin for its grid grew out of it"] if strands else []
 
 
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
@@ -324,8 +330,9 @@ def _sound(
     faces: Int[Tensor, "f 3"],
     silhouettes: Bool[Tensor, "t k h w"],
     video: DrivingVideo | None,
+    strands: tuple[Tube, ...],
 ) -> tuple[Float[Tensor, "t v 3"], list[str]]:
-    """Return offsets with fewer crossings and flipped faces, and a note if there were crossings.
+    """Return offsets with the video's outlines, fewer crossings and flipped faces, and a note if there were crossings.
 
     Faces may not be flipped against the reference frame, nor against the first frame, which is the base of the morph
     targets.
@@ -333,6 +340,10 @@ def _sound(
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
     places = f"parts that had sunk into each other in {frames} of {len(offsets)} frames"
     notes = [f"{places} were moved apart, as far as outlines allow"] if frames else []
+    if video is not None:
+        if strands:
+            separated = find_strands_again(vertices, separated, faces, strands, video.alpha[..., 0])
+        separated = fit_outline_detail(vertices, separated, faces, video.alpha[..., 0])
     turned = turn_back(vertices, separated, faces, silhouettes)
     first = turned[0]
     return turn_back(vertices + first, turned - first, faces, silhouettes) + first, notes
@@ -346,13 +357,10 @@ def _registered(
     offsets: Float[Tensor, "t v 3"],
     faces: Int[Tensor, "f 3"],
     video: DrivingVideo,
-    strands: tuple[Tube, ...],
 ) -> tuple[TexturedMesh, Float[Tensor, "t v 3"]]:
-    """Return the mesh with a texture from the video, and offsets that agree with the video's colors and outlines."""
+    """Return the mesh with a texture from the video, and offsets that agree with the video's colors."""
     mesh, pictures = textured(mesh, vertices + offsets), video.over(video.frames.new_ones(3))
-    offsets = register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
-    offsets = fit_outline_detail(vertices, offsets, faces, video.alpha[..., 0])
-    return mesh, find_strands_again(vertices, offsets, faces, strands, video.alpha[..., 0])
+    return mesh, register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
 
 
 def _fitted(

@@ -44,6 +44,7 @@ LOST = 3.0  # mean distance from middle lines, pixels, above which a frame does 
 SHOWN = 0.4  # share of its points that the surface must not cover there
 SEEN = 0.5  # share of the frames that must show it
 STIFF = (3.0, 3.0, 2.0, 2.0, 1.0, 1.0)  # standard deviation of the steps of bending along the rings, by rounds
+SHARP = 0.5  # cosine between steps of a tracked line below which tracking has lost it
 USED = 8.0  # pixels around a strand whose middle lines no other one takes
 
 Vertices = Float64[np.ndarray, "v 3"]
@@ -58,11 +59,13 @@ class Fit(NamedTuple):
         line: column and row of its points; None if it is not shown.
         turn: about its root, from where the surface carries it, radians.
         scale: of its length.
+        distance: of its points from middle lines, mean, pixels.
     """
 
     line: Float64[np.ndarray, "k 2"] | None
     turn: float
     scale: float
+    distance: float
 
 
 def grow_moving_strands(
@@ -104,16 +107,15 @@ def grow_moving_strands(
         larger = with_strand(Grown(poses[frame], corners, tubes), strand, taken)
         if larger is None:
             continue
-        moved, lines, shown = _followed(larger, poses, targets, covered)
+        moved = np.concatenate([poses, np.repeat(larger.vertices[None, len(taken) :], len(poses), 0)], 1)
+        moved, lines, shown = _followed(larger.vertices, larger.faces, larger.tubes[-1], moved, targets, covered)
         if shown < SEEN:
             continue
         moved[frame] = larger.vertices
         poses, corners, tubes = moved, larger.faces, larger.tubes
         taken = np.append(taken, np.zeros(len(larger.vertices) - len(taken), bool))
         taken[[tubes[-1].tip, *tubes[-1].root]] = True
-        for other, line in enumerate(lines):
-            if len(targets[other]):
-                targets[other] = targets[other][~_near(targets[other], line, USED)]
+        targets = _without(targets, lines)
     if not tubes:
         return vertices, offsets, faces, ()
     together = torch.from_numpy(poses).to(vertices)
@@ -136,27 +138,21 @@ def find_strands_again(
         tubes: strands of the mesh.
         alpha: of the video, at the input view.
     """
-    if not tubes:
-        return offsets
-    found, strands = offsets.clone(), np.zeros(len(vertices), bool)
+    poses = torch.cat([vertices + offsets, vertices[None]]).double().numpy()
+    corners, strands = faces.numpy(), np.zeros(len(vertices), bool)
+    strands[np.concatenate([_own(tube) for tube in tubes])] = True
+    body = corners[~strands[corners].any(1)]
+    covered, targets = np.zeros((len(alpha), SIZE, SIZE), bool), [np.zeros((0, 2))] * len(alpha)
+
+    def look(frame: int) -> None:
+        covered[frame] = covered_pixels(poses[frame], body)
+        targets[frame] = _targets(_mask(alpha[frame]), covered[frame])
+
+    run_parallel([partial(look, frame) for frame in range(len(alpha))])
     for tube in tubes:
-        strands[[*tube.rings.ravel(), tube.tip]] = True
-    body = faces.numpy()[~strands[faces.numpy()].any(1)]
-
-    def find(frame: int) -> None:
-        pose = (vertices + offsets[frame]).double().numpy()
-        covered = covered_pixels(pose, body)
-        targets = _targets(_mask(alpha[frame]), covered)
-        for tube in tubes:
-            line, root = _line(pose, tube)
-            fit = _fitted(line, root, targets, covered)
-            if fit.line is not None:
-                _move(pose, tube, fit.line - line)
-                targets = targets[~_near(targets, fit.line, USED)]
-        found[frame] = torch.from_numpy(pose).to(offsets) - vertices
-
-    run_parallel([partial(find, frame) for frame in range(len(offsets))])
-    return found
+        poses, lines, _ = _followed(poses[-1], corners, tube, poses, targets, covered, known=True)
+        targets = _without(targets, lines)
+    return torch.from_numpy(poses[:-1]).to(offsets) - vertices
 
 
 def _mask(alpha: Float[Tensor, "i j"]) -> Bool[np.ndarray, "h w"]:
@@ -178,29 +174,58 @@ def _near(
     return np.asarray(cKDTree(others).query(points)[0]) < distance
 
 
+def _without(
+    targets: list[Float64[np.ndarray, "_ 2"]], lines: list[Float64[np.ndarray, "k 2"]]
+) -> list[Float64[np.ndarray, "_ 2"]]:
+    """Return the targets of every frame that are not near a line."""
+    return [here[~_near(here, line, USED)] if len(here) else here for here, line in zip(targets, lines, strict=True)]
+
+
+def _own(tube: Tube) -> Int[np.ndarray, " n"]:
+    """Return the vertices of a strand."""
+    return np.append(tube.rings.ravel(), tube.tip)
+
+
 def _followed(
-    larger: Grown,
+    shape: Vertices,
+    faces: Int[np.ndarray, "f 3"],
+    tube: Tube,
     poses: Poses,
     targets: list[Float64[np.ndarray, "_ 2"]],
     covered: Bool[np.ndarray, "t h w"],
-) -> tuple[Float64[np.ndarray, "p n 3"], list[Float64[np.ndarray, "k 2"]], float]:
-    """Return all poses with the last strand of a surface, its lines in the frames, and the share that shows them."""
-    tube = larger.tubes[-1]
-    own = np.append(tube.rings.ravel(), tube.tip)
-    near = np.zeros(len(larger.vertices), bool)
+    known: bool = False,
+) -> tuple[Poses, list[Float64[np.ndarray, "k 2"]], float]:
+    """Return all poses with a strand where the frames show it, its lines there, and the share of those that do.
+
+    Args:
+        shape: vertices with the strand as it grew.
+        faces: of the mesh with the strand.
+        tube: the strand.
+        poses: of the other vertices.
+        targets: column and row of the pixels of middle lines, by frame.
+        covered: pixels of the mesh without the strand.
+        known: the poses have the strand, where tracking left it.
+    """
+    own, moved = _own(tube), poses.copy()
+    near = np.zeros(len(shape), bool)
     near[tube.root] = True
-    near = grown(near, edge_graph(larger.faces, len(near)), RINGS)
+    near = grown(near, edge_graph(faces, len(near)), RINGS)
     near[own] = False
-    moved = np.zeros((len(poses), *larger.vertices.shape))
-    moved[:, : poses.shape[1]] = poses
-    lines, fits = [np.zeros((0, 2))] * len(targets), [Fit(None, 0.0, 1.0)] * len(targets)
+    lines, fits = [np.zeros((0, 2))] * len(targets), [Fit(None, 0.0, 1.0, FAR)] * len(targets)
 
     def carry(frame: int) -> None:
         pose = moved[frame]
-        pose[own] = larger.vertices[own] + (pose[near] - larger.vertices[near]).mean(0)
-        if frame < len(targets):
-            lines[frame], root = _line(pose, tube)
-            fits[frame] = _fitted(lines[frame], root, targets[frame], covered[frame])
+        tracked = _line(pose, tube)[0] if known and frame < len(targets) else None
+        pose[own] = shape[own] + (pose[near] - shape[near]).mean(0)
+        if frame == len(targets):
+            return
+        lines[frame], root = _line(pose, tube)
+        fits[frame] = _fitted(lines[frame], root, targets[frame], covered[frame])
+        if tracked is not None and _regular(tracked, lines[frame], root):
+            other = _fitted(tracked, root, targets[frame], covered[frame])
+            if other.line is None:
+                other = other._replace(line=tracked, distance=FAR)
+            fits[frame] = min(fits[frame], other, key=lambda fit: np.inf if fit.line is None else fit.distance)
 
     run_parallel([partial(carry, frame) for frame in range(len(moved))])
     shown = np.flatnonzero([fit.line is not None for fit in fits])
@@ -210,35 +235,37 @@ def _followed(
         line, root = _line(moved[frame], tube)
         turn, scale = (np.interp(frame, shown, [getattr(fits[k], name) for k in shown]) for name in ("turn", "scale"))
         lines[frame] = _turned(line, root, np.array([turn]), np.array([scale]))[0] if fit.line is None else fit.line
-        _move(moved[frame], tube, lines[frame] - line)
+        _place(shape, moved[frame], tube, lines[frame])
     return moved, lines, len(shown) / len(targets)
 
 
 def _line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:
     """Return column and row of the middle line of a strand, and those of its root."""
-    centers = np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
-    return _pixels(centers)[0], _pixels(pose[tube.root].mean(0, keepdims=True))[0]
+    return _pixels(_centers(pose, tube))[0], _pixels(pose[tube.root].mean(0, keepdims=True))[0]
 
 
-def _move(pose: Vertices, tube: Tube, steps: Float64[np.ndarray, "k 2"]) -> None:
-    """Move the points of the middle line of a strand by pixels, parallel to the picture; its rings turn with it."""
-    centers = np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
-    after = centers + steps * _pixels(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
-    root = pose[tube.root].mean(0, keepdims=True)
-    turns = Rotation.concatenate(
-        [
-            Rotation.align_vectors(to[None], along[None])[0]
-            for along, to in zip(*(_directions(root, line) for line in (centers, after)), strict=True)
-        ]
-    )
-    for ring, center, new, turn in zip(tube.rings, centers, after, turns, strict=False):
-        pose[ring] = turn.apply(pose[ring] - center) + new
+def _place(shape: Vertices, pose: Vertices, tube: Tube, line: Float64[np.ndarray, "k 2"]) -> None:
+    """Move a strand to a line in the picture, at the depth that it has; its rings are those of the shape, turned."""
+    centers = _centers(pose, tube)
+    step = line - _pixels(centers)[0]
+    after = centers + step * _pixels(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
+    before = _centers(shape, tube)
+    directions = zip(_directions(shape, tube, before), _directions(pose, tube, after), strict=True)
+    turns = [Rotation.align_vectors(to[None], along[None])[0] for along, to in directions]
+    for ring, center, new, turn in zip(tube.rings, before, after, turns, strict=False):
+        pose[ring] = turn.apply(shape[ring] - center) + new
     pose[tube.tip] = after[-1]
 
 
-def _directions(root: Float64[np.ndarray, "1 3"], line: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
-    """Return the directions of a line at its points, which begins at a root."""
-    directions: Float64[np.ndarray, "k 3"] = np.gradient(np.concatenate([root, line]), axis=0)[1:]
+def _centers(pose: Vertices, tube: Tube) -> Float64[np.ndarray, "k 3"]:
+    """Return the middle line of a strand."""
+    return np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
+
+
+def _directions(pose: Vertices, tube: Tube, centers: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
+    """Return the directions of a middle line that begins at the root of a strand."""
+    root = pose[tube.root].mean(0, keepdims=True)
+    directions: Float64[np.ndarray, "k 3"] = np.gradient(np.concatenate([root, centers]), axis=0)[1:]
     return directions
 
 
@@ -270,7 +297,7 @@ def _fitted(
 ) -> Fit:
     """Return a line, turned and scaled about its root and bent to the targets, if the frame shows it."""
     if len(targets) == 0:
-        return Fit(None, 0.0, 1.0)
+        return Fit(None, 0.0, 1.0, FAR)
     tree = cKDTree(targets)
 
     def distances(points: Float64[np.ndarray, "*n 2"]) -> tuple[Float64[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
@@ -289,7 +316,22 @@ def _fitted(
         apart, nearest = map(np.asarray, tree.query(bent, distance_upper_bound=FAR))
         steps = np.zeros_like(bent)
         steps[apart < FAR] = targets[nearest[apart < FAR]] - bent[apart < FAR]
+        along = np.gradient(np.concatenate([root, bent]), axis=0)[1:]
+        along /= np.linalg.norm(along, axis=1, keepdims=True).clip(1e-9)
+        steps -= (steps * along).sum(1, keepdims=True) * along  # points keep their distances
         bent = bent + ndimage.gaussian_filter1d(steps, stiff, axis=0, mode="nearest")
     near, hidden = distances(bent)
-    shown = (~hidden).mean() >= SHOWN and near[~hidden].mean() <= LOST
-    return Fit(bent if shown else None, float(turns[best]), float(scales[best]))
+    distance = float(near[~hidden].mean()) if (~hidden).any() else FAR
+    shown = (~hidden).mean() >= SHOWN and distance <= LOST
+    return Fit(bent if shown else None, float(turns[best]), float(scales[best]), distance)
+
+
+def _regular(
+    line: Float64[np.ndarray, "k 2"], other: Float64[np.ndarray, "k 2"], root: Float64[np.ndarray, "1 2"]
+) -> bool:
+    """Tell whether a line has the length of another one, about, and no sharp bend."""
+    steps, others = (np.diff(np.concatenate([root, points]), axis=0) for points in (line, other))
+    lengths = np.linalg.norm(steps, axis=1)
+    share = lengths.sum() / max(float(np.linalg.norm(others, axis=1).sum()), 1e-9)
+    cosines = (steps[1:] * steps[:-1]).sum(1) / (lengths[1:] * lengths[:-1]).clip(1e-9)
+    return bool(SCALES[0] <= share <= SCALES[-1] and cosines.min(initial=1) > SHARP)

@@ -6,7 +6,6 @@ import trimesh
 from skimage.draw import line
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.extraction.strands import Tube
 from dg4d_lib.mesh.folds import genus
 from dg4d_lib.mesh.tracking.moving_strands import find_strands_again, grow_moving_strands
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
@@ -96,9 +95,3 @@ def test_strands_that_were_moved_away_are_found_again() -> None:
     assert max(shares(grown, away, corners, alpha)) < 0.4
     found = find_strands_again(grown, away, corners, tubes, alpha)
     assert min(shares(grown, found, corners, alpha)) > 0.7
-
-
-def test_without_strands_nothing_is_searched() -> None:
-    vertices, offsets, faces, alpha = walking_ball(())
-    tubes: tuple[Tube, ...] = grow_moving_strands(vertices, offsets, faces, alpha, 0)[-1]
-    assert tubes == () and find_strands_again(vertices, offsets, faces, tubes, alpha) is offsets
