@@ -306,7 +306,9 @@ def _guided(
 
 def _note(strands: tuple[Tube, ...]) -> list[str]:
     """Tell how many strands a mesh has, if any."""
-    return [f"{len(strands)} strands of the video that were too thin for its grid grew out of it"] if strands else []
+    return (
+        [f"strands of the video that are too thin for its grid and grew out of it: {len(strands)}"] if strands else []
+    )
 
 
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
@@ -330,7 +332,7 @@ def _sound(
     faces: Int[Tensor, "f 3"],
     silhouettes: Bool[Tensor, "t k h w"],
     video: DrivingVideo | None,
-    strands: tuple[Tube, ...],
+    strands: tuple[Tube, ...] = (),
 ) -> tuple[Float[Tensor, "t v 3"], list[str]]:
     """Return offsets with the video's outlines, fewer crossings and flipped faces, and a note if there were crossings.
 
@@ -340,13 +342,14 @@ def _sound(
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
     places = f"parts that had sunk into each other in {frames} of {len(offsets)} frames"
     notes = [f"{places} were moved apart, as far as outlines allow"] if frames else []
-    if video is not None:
-        if strands:
-            separated = find_strands_again(vertices, separated, faces, strands, video.alpha[..., 0])
-        separated = fit_outline_detail(vertices, separated, faces, video.alpha[..., 0])
+    if video is not None and strands:
+        separated = find_strands_again(vertices, separated, faces, strands, video.alpha[..., 0])
     turned = turn_back(vertices, separated, faces, silhouettes)
     first = turned[0]
-    return turn_back(vertices + first, turned - first, faces, silhouettes) + first, notes
+    turned = turn_back(vertices + first, turned - first, faces, silhouettes) + first
+    if video is not None:
+        turned = fit_outline_detail(vertices, turned, faces, video.alpha[..., 0])
+    return turned, notes
 
 
 def _registered(

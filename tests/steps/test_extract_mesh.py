@@ -280,6 +280,36 @@ def test_no_face_is_flipped_against_the_first_frame() -> None:
     assert flipped(vertices, sound) == flipped(vertices + sound[0], sound) == 0
 
 
+@pytest.mark.parametrize("mode", ["tracked", "per_frame"])
+def test_a_leg_that_the_grid_lacks_grows_out_of_the_mesh(tmp_path: Path, mode: str) -> None:
+    camera, reach = OrbitCamera(width=128, height=128), torch.linspace(0, 0.7, 400)
+    alphas = []
+    for frame in range(FRAMES):
+        means = ball().means + (frame + 1) * SHIFT
+        alpha = get_rasterizer("cpu")(replace(ball(), means=means), [camera], torch.zeros(3)).alpha[0]
+        leg = (frame + 1) * SHIFT + reach[:, None] * torch.tensor([-0.9, -0.4, 0.0])
+        in_camera = torch.cat([leg, torch.ones(len(leg), 1)], 1).double() @ camera.viewmat().T
+        columns, rows = (in_camera[:, :2] / in_camera[:, 2:3] * camera.focal + 64).long().T
+        alpha[rows, columns] = 1
+        alphas.append(alpha)
+    alpha = torch.stack(alphas)
+    green = torch.tensor([0.1, 0.9, 0.2]).expand(*alpha.shape[:-1], 3).contiguous()
+    write_frames(tmp_path / "video", DrivingVideo(green, alpha, 8.0))
+    settings = MESH.model_copy(update={"mode": mode, "edge_length": 0.05})
+    _, facts = extract(tmp_path, ball(), settings, tmp_path / "video")
+    if mode == "tracked":
+        asset = read_tracked(tmp_path / "tracked")
+        moved = [replace(asset.mesh, vertices=asset.mesh.vertices + offset) for offset in asset.offsets]
+        assert any(note.endswith("grew out of it: 1") for note in facts.notes)
+    else:
+        moved = read_meshes(tmp_path / "meshes")
+    for mesh, expected, frame in zip(moved, alpha, range(FRAMES), strict=True):
+        far = (mesh.vertices - (frame + 1) * SHIFT).norm(dim=-1)
+        assert far.max() > 0.65 and far.median() < 0.55
+        _, covered = render_mesh(mesh, [camera])
+        assert iou(covered, expected[None]).min() > 0.9
+
+
 @pytest.mark.parametrize("source", ["prior", "gaussians"])
 def test_a_guessed_subject_has_the_surface_of_the_shape_network(tmp_path: Path, source: str) -> None:
     alpha = green_video(tmp_path / "video")
