@@ -35,17 +35,16 @@ from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.fairing import fair
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture, drawn_gaussians
-from dg4d_lib.mesh.texturing.chart_packing import QUICK, THOROUGH, Effort
+from dg4d_lib.mesh.texturing.bake import Draw, drawn_gaussians
+from dg4d_lib.mesh.texturing.chart_packing import QUICK
 from dg4d_lib.mesh.texturing.footage import fit_texture
-from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.color_registration import register_to_colors
 from dg4d_lib.mesh.tracking.elastic import relax, turn_back
 from dg4d_lib.mesh.tracking.isosurface_projection import project_to_isosurface
 from dg4d_lib.mesh.tracking.moving_strands import find_strands_again, grow_moving_strands
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
 from dg4d_lib.mesh.tracking.outline_detail import fit_outline_detail
-from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced, relative_to_frame
+from dg4d_lib.mesh.tracking.reference_frame import relative_to_frame
 from dg4d_lib.mesh.tracking.separation import separate
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
@@ -57,20 +56,26 @@ from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
 from steps.fitting.guesses import guessed_shapes
+from steps.fitting.textures import (
+    LEAST_ERROR,
+    Frame,
+    baked,
+    colored,
+    fitted,
+    footage_of,
+    frame_at,
+    shown_by,
+    squared_error,
+    squared_errors,
+)
 from steps.profiles import FrameRange
 from steps.runtime.job import Job, StepReport
 
-Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
-Footage = Callable[[Int[Tensor, " w"]], list[PosedSurface]]
 Surface = tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]
 Textured = Callable[[TexturedMesh, Float[Tensor, "t v 3"]], TexturedMesh]  # gives a mesh its texture, by its positions
 
-COLORED = 16  # frames of the driving video that are baked into the texture of a mesh that follows it
-SELECTIVITY = 2  # exponent of such a frame's weight in the inverse of its squared error
-FITTED, FITTED_SELECTIVITY = 32, 1  # frames that the texture is then fitted to, and the exponent of their weights
 LOST_DB, LOST_SHARE = 8.0, 1 / 8  # of PSNR by which a frame is lost, and the largest share of such frames
 CLOSE_ERROR = 1e-3  # squared error below which Gaussians are not closer to the video, 30 dB
-LEAST_ERROR = 1e-4  # squared error below which frames weigh alike, 40 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
 PICTURE_CAMERAS = [OrbitCamera(0, azimuth, width=256, height=256) for azimuth in (0.0, 75.0, 180.0, 285.0)]
@@ -159,7 +164,7 @@ def run(job: Job) -> StepReport:
             raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
-            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings, _at(video, frame))
+            meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings, frame_at(video, frame))
             job.progress(frame - first + 1, end - first, {})
         write_meshes(job.outputs["meshes"], meshes)
         notes = _soundness(meshes)
@@ -182,8 +187,8 @@ def textured_mesh(
         alpha = frame[1][..., 0]
         vertices, faces = with_strands(vertices, faces, alpha)
         vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha[None])[0]
-    shown = _shown(vertices, faces, frame)
-    mesh, sources = _colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
+    shown = shown_by(vertices, faces, frame)
+    mesh, sources = colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
 
 
@@ -232,8 +237,8 @@ def _tracked(
     frame, level = plan.reference_frame, plan.level
     vertices, faces = rest.vertices, rest.faces
     with ThreadPoolExecutor(1) as beside:  # unwrapping keeps one core busy, and tracking needs no texture
-        shown = _shown(vertices, faces, _at(video, frame))
-        coloring = beside.submit(_colored, vertices, faces, rest.draw, settings, shown)
+        shown = shown_by(vertices, faces, frame_at(video, frame))
+        coloring = beside.submit(colored, vertices, faces, rest.draw, settings, shown)
         skinned = skin_vertices(vertices, rest.gaussians, relative_to_frame(displacement, frame))
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
@@ -245,8 +250,10 @@ def _tracked(
         alpha = video.alpha[..., 0]
         vertices, relaxed, faces, strands = grow_moving_strands(vertices, relaxed, faces, alpha, frame)
         if strands:
-            mesh, sources = _colored(vertices, faces, rest.draw, settings, _shown(vertices, faces, _at(video, frame)))
-        textured = partial(_fitted, faces=faces, sources=sources, video=video)
+            mesh, sources = colored(
+                vertices, faces, rest.draw, settings, shown_by(vertices, faces, frame_at(video, frame))
+            )
+        textured = partial(fitted, faces=faces, sources=sources, video=video)
         mesh, relaxed = _registered(mesh, textured, sources, vertices, relaxed, faces, video)
     offsets, separated = _sound(vertices, relaxed, faces, silhouettes, video, strands)
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
@@ -288,13 +295,13 @@ def _guided(
     )  # fmt: skip
     alpha = video.alpha[..., 0]
     vertices, offsets, faces, strands = grow_moving_strands(vertices, offsets, faces, alpha, best.frame)
-    mesh, sources = _colored(
-        vertices, faces, draw, settings, lambda sources: _footage(vertices + offsets, faces, sources, video)
+    mesh, sources = colored(
+        vertices, faces, draw, settings, lambda sources: footage_of(vertices + offsets, faces, sources, video)
     )  # fmt: skip
     refined = refine_tracking(mesh, sources, vertices, offsets, faces, states, video, level, rasterize, settings)
     normals = vertex_normals(vertices, faces)[sources]
     textured = partial(
-        _baked, faces=faces, sources=sources, video=video, normals=normals, draw=draw, settings=settings
+        baked, faces=faces, sources=sources, video=video, normals=normals, draw=draw, settings=settings
     )  # fmt: skip
     mesh, refined = _registered(mesh, textured, sources, vertices, refined, faces, video)
     silhouettes = render_silhouettes(states, range(len(refined)), rasterize, alpha)
@@ -314,15 +321,15 @@ def _note(strands: tuple[Tube, ...]) -> list[str]:
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
     """Return the PSNR of the candidate's renders against the video, dB, with a texture from there."""
     moved, faces = candidate.rest.vertices + candidate.offsets, candidate.rest.faces
-    mesh, sources = _colored(
+    mesh, sources = colored(
         candidate.rest.vertices,
         faces,
         candidate.rest.draw,
         settings,
-        lambda sources: _footage(moved, faces, sources, video),
+        lambda sources: footage_of(moved, faces, sources, video),
         QUICK,
     )
-    errors = _squared_errors(mesh, _footage(moved, faces, sources, video))
+    errors = squared_errors(mesh, footage_of(moved, faces, sources, video))
     return sum(-10 * math.log10(max(error, LEAST_ERROR)) for error in errors) / len(errors)
 
 
@@ -366,70 +373,6 @@ def _registered(
     return mesh, register_to_colors(mesh, sources, vertices, offsets, faces, pictures, sound=True)
 
 
-def _fitted(
-    mesh: TexturedMesh,
-    moved: Float[Tensor, "t v 3"],
-    faces: Int[Tensor, "f 3"],
-    sources: Int[Tensor, " w"],
-    video: DrivingVideo,
-) -> TexturedMesh:
-    """Return the mesh with its texture fitted to the video."""
-    footage = _footage(moved, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
-    return replace(mesh, texture=fit_texture(mesh, footage))
-
-
-def _baked(
-    mesh: TexturedMesh,
-    moved: Float[Tensor, "t v 3"],
-    faces: Int[Tensor, "f 3"],
-    sources: Int[Tensor, " w"],
-    video: DrivingVideo,
-    normals: Float[Tensor, "w 3"],
-    draw: Draw,
-    settings: MeshSettings,
-) -> TexturedMesh:
-    """Return the mesh with a texture baked anew from the frames that it follows best, and fitted to the video."""
-    footage = _footage(moved, faces, sources, video, mesh)
-    texture = bake_texture(mesh.vertices, normals, mesh.faces, mesh.uvs, draw, settings, footage)
-    return _fitted(replace(mesh, texture=texture), moved, faces, sources, video)
-
-
-def _footage(
-    moved: Float[Tensor, "t v 3"],
-    faces: Int[Tensor, "f 3"],
-    sources: Int[Tensor, " w"],
-    video: DrivingVideo,
-    textured: TexturedMesh | None = None,
-    count: int = COLORED,
-    selectivity: float = SELECTIVITY,
-) -> list[PosedSurface]:
-    """Return some frames of the video with the surface, split along seams, that they show.
-
-    With a textured mesh, frames weigh by how well its renders agree with them: badly tracked ones blur the texture.
-    """
-    frames = evenly_spaced(len(video), count)
-    surfaces = [surface for frame in frames for surface in _shown(moved[frame], faces, _at(video, frame))(sources)]
-    if textured is None:
-        return surfaces
-    errors = _squared_errors(textured, surfaces)
-    least = max(min(errors), LEAST_ERROR)
-    weights = [(least / max(error, least)) ** selectivity for error in errors]
-    return [replace(surface, weight=weight) for surface, weight in zip(surfaces, weights, strict=True)]
-
-
-def _squared_errors(mesh: TexturedMesh, surfaces: list[PosedSurface]) -> list[float]:
-    """Return the mean squared errors of renders from the input camera against frames of the video, over white."""
-    return [_squared_error(mesh, surface.vertices, (surface.color, surface.alpha)) for surface in surfaces]
-
-
-def _squared_error(mesh: TexturedMesh, vertices: Float[Tensor, "v 3"], frame: Frame) -> float:
-    """Return the mean squared error of the mesh with these vertices against a frame of the video, over white."""
-    expected = color_over_white(*frame)
-    camera = OrbitCamera(width=expected.shape[1], height=expected.shape[0])
-    rendered = color_over_white(*render_mesh(replace(mesh, vertices=vertices), [camera]))[0]
-    return float((rendered - expected).square().mean())
-
-
 def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, rasterize: Rasterizer) -> int:
     """Count the frames that the Gaussians show closer by `LOST_DB` or more than the mesh does, at the input view."""
     size = video.frames.shape[1]
@@ -439,23 +382,8 @@ def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, r
         with torch.no_grad():
             drawn = rasterize(states.at(frame), [camera], white).color[0]
         best = max(float((drawn - color_over_white(*shown)).square().mean()), CLOSE_ERROR)
-        lost += _squared_error(tracked.mesh, moved[frame], shown) > best * 10 ** (LOST_DB / 10)
+        lost += squared_error(tracked.mesh, moved[frame], shown) > best * 10 ** (LOST_DB / 10)
     return lost
-
-
-def _at(video: DrivingVideo | None, frame: int) -> Frame | None:
-    return None if video is None else (video.frames[frame], video.alpha[frame])
-
-
-def _shown(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], frame: Frame | None) -> Footage:
-    """Return a function that splits a surface along seams, as a frame of the video shows it."""
-
-    def split(sources: Int[Tensor, " w"]) -> list[PosedSurface]:
-        if frame is None:
-            return []
-        return [PosedSurface(vertices[sources], vertex_normals(vertices, faces)[sources], *frame)]
-
-    return split
 
 
 def _isosurface(gaussians: Gaussians, level: float, rasterize: Rasterizer, settings: MeshSettings) -> Surface:
@@ -468,23 +396,6 @@ def _isosurface(gaussians: Gaussians, level: float, rasterize: Rasterizer, setti
 def _faired(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], settings: MeshSettings) -> Surface:
     vertices = unfold(fair(unfold(vertices, faces), faces, settings.fairing), faces)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
-
-
-def _colored(
-    vertices: Float[Tensor, "v 3"],
-    faces: Int[Tensor, "f 3"],
-    draw: Draw,
-    settings: MeshSettings,
-    footage: Footage,
-    effort: Effort = THOROUGH,
-) -> tuple[TexturedMesh, Int[Tensor, " w"]]:
-    """Return the unwrapped mesh with a baked texture, and the source vertex of each of its vertices."""
-    unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size, settings.unwrap, effort)
-    sources, corners, uvs = map(torch.from_numpy, unwrapped)
-    normals = vertex_normals(vertices, faces)[sources]
-    moments = footage(sources)
-    texture = bake_texture(vertices[sources], normals, corners, uvs, draw, settings, moments)
-    return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 
 def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
