@@ -30,6 +30,7 @@ SLENDER = 4.0  # length of a strand, in its radii, at least
 MARGIN = 16  # pixels around what is not covered
 REACH = 48.0  # pixels from the root of a strand to the vertex that it grows out of
 ROUNDS = 4  # branches of a strand grow in the round after it
+MOST = 16  # strands that are tried in a round, the longest ones: fringes of a cut-out are no legs
 SMOOTH = 4.0  # standard deviation of the middle line along its pixels
 THINNEST = 2.0  # pixels of radius
 TIP = 6  # pixels of the middle line that show where it goes on
@@ -105,7 +106,8 @@ def grow_strands(
     taken = np.zeros(len(vertices), bool)
     for _ in range(ROUNDS):
         before = len(grown.tubes)
-        for strand in find_strands(mask, covered_pixels(grown.vertices, grown.faces)):
+        strands = find_strands(mask, covered_pixels(grown.vertices, grown.faces))
+        for strand in sorted(strands, key=lambda one: -len(one.points))[:MOST]:
             larger = with_strand(grown, strand, taken)
             if larger is not None:
                 grown = larger
@@ -190,7 +192,6 @@ def with_strand(grown: Grown, strand: Strand, taken: Bool[np.ndarray, " v"]) -> 
     in_camera = vertices @ view[:3, :3].T + view[:3, 3]
     pixels = in_camera[:, :2] / in_camera[:, 2:] * camera.focal + SIZE / 2
     distances = np.linalg.norm(pixels - strand.points[0], axis=1) + np.where(taken, np.inf, 0)
-    sound = ~DefectFinder(faces).defective(vertices)
     for base in np.argsort(distances)[:ATTEMPTS]:
         root = _ring(faces, int(base))
         if distances[base] > REACH or root is None or taken[root].any():
@@ -199,9 +200,8 @@ def with_strand(grown: Grown, strand: Strand, taken: Bool[np.ndarray, " v"]) -> 
         flat = (strand.points - SIZE / 2) * depth / camera.focal
         path = (np.concatenate([flat, np.full((len(flat), 1), depth)], 1) - view[:3, 3]) @ view[:3, :3]
         larger = _with_tube(grown, int(base), root, path, strand.radii * depth / camera.focal)
-        kept = (faces != base).all(1)  # they come first
-        bad = DefectFinder(larger.faces).defective(larger.vertices)
-        if not (bad[: kept.sum()] & sound[kept]).any() and not bad[kept.sum() :].any():
+        new = np.arange(len(larger.faces)) >= (faces != base).all(1).sum()
+        if not DefectFinder(larger.faces).defective(larger.vertices, new).any():
             return larger
     return None
 
