@@ -49,6 +49,22 @@ class Strand(NamedTuple):
     radii: Float64[np.ndarray, " p"]
 
 
+class MiddleLines(NamedTuple):
+    """Middle lines of the parts of a mask that a surface does not cover.
+
+    Attributes:
+        marks: pixels of the lines, in a part of the picture.
+        beyond: distance of the pixels of that part from covered ones.
+        radius: their distance from the outside of the mask.
+        corner: column and row of the first of them.
+    """
+
+    marks: Bool[np.ndarray, "i j"]
+    beyond: Float[np.ndarray, "i j"]
+    radius: Float[np.ndarray, "i j"]
+    corner: Int[np.ndarray, " 2"]
+
+
 class Tube(NamedTuple):
     """Vertices of a strand on a surface.
 
@@ -106,7 +122,7 @@ def grow_strands(
     taken = np.zeros(len(vertices), bool)
     for _ in range(ROUNDS):
         before = len(grown.tubes)
-        strands = find_strands(mask, covered_pixels(grown.vertices, grown.faces))
+        strands = find_strands(middle_lines(mask, covered_pixels(grown.vertices, grown.faces)))
         for strand in sorted(strands, key=lambda one: -len(one.points))[:MOST]:
             larger = with_strand(grown, strand, taken)
             if larger is not None:
@@ -127,10 +143,9 @@ def covered_pixels(vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, 
     return covered
 
 
-def find_strands(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> list[Strand]:
-    """Return the longest strand of every part of the mask that is not covered."""
-    lines, beyond, radius, corner = middle_lines(mask, covered)
-    pixels = np.stack(np.nonzero(lines), 1)
+def find_strands(lines: MiddleLines) -> list[Strand]:
+    """Return the longest strand of every part of a mask that is not covered."""
+    pixels = np.stack(np.nonzero(lines.marks), 1)
     pairs = cKDTree(pixels).query_pairs(GAP, output_type="ndarray") if len(pixels) else np.zeros((0, 2), np.int64)
     gaps = np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
     tree = minimum_spanning_tree(coo_array((gaps, tuple(pairs.T)), shape=(len(pixels), len(pixels))).tocsr())
@@ -138,31 +153,24 @@ def find_strands(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]
     strands = []
     for part in np.unique(parts):
         here = np.flatnonzero(parts == part)
-        path = pixels[_longest_path(tree, int(here[beyond[tuple(pixels[here].T)].argmin()]))]
-        radii = radius[tuple(path.T)]
+        path = pixels[_longest_path(tree, int(here[lines.beyond[tuple(pixels[here].T)].argmin()]))]
+        radii = lines.radius[tuple(path.T)]
         if len(path) >= max(SHORTEST, SLENDER * radii.mean()) and np.median(radii) <= THICKEST:
-            points = ndimage.gaussian_filter1d(path[:, ::-1] + corner + 0.5, SMOOTH, axis=0, mode="nearest")
+            points = ndimage.gaussian_filter1d(path[:, ::-1] + lines.corner + 0.5, SMOOTH, axis=0, mode="nearest")
             strands.append(Strand(points, ndimage.gaussian_filter1d(radii, SMOOTH, mode="nearest").clip(THINNEST)))
     return strands
 
 
-def middle_lines(
-    mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]
-) -> tuple[Bool[np.ndarray, "i j"], Float[np.ndarray, "i j"], Float[np.ndarray, "i j"], Int[np.ndarray, " 2"]]:
-    """Mark the middle lines of the parts of a mask that are not covered.
-
-    Returns:
-        The marks around what is not covered; the distances of these pixels from covered ones and from the outside of
-        the mask; and column and row of the first of them.
-    """
+def middle_lines(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
+    """Return the middle lines of the parts of a mask that are not covered."""
     whole = _around(mask, 1)
     beyond = ndimage.distance_transform_edt(~covered[whole]) if covered.any() else np.full(mask[whole].shape, np.inf)
     uncovered = mask[whole] & (beyond > NEAR)
     part = _around(uncovered, MARGIN)
     beyond, here = beyond[part], mask[whole][part]
-    lines = skeletonize(here) & (beyond > NEAR)
-    radius = ndimage.distance_transform_edt(here)
-    return lines, beyond, radius, np.array([whole[1].start + part[1].start, whole[0].start + part[0].start])
+    marks, radius = skeletonize(here) & (beyond > NEAR), ndimage.distance_transform_edt(here)
+    corner = np.array([whole[1].start + part[1].start, whole[0].start + part[0].start])
+    return MiddleLines(marks, beyond, radius, corner)
 
 
 def _around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:

@@ -25,6 +25,7 @@ from dg4d_lib.mesh.extraction.strands import (
     SIZE,
     THICKEST,
     Grown,
+    MiddleLines,
     Strand,
     Tube,
     covered_pixels,
@@ -89,10 +90,10 @@ def grow_moving_strands(
     targets, candidates = [np.zeros((0, 2))] * len(alpha), list[tuple[int, Strand]]()
 
     def look(frame: int) -> None:
-        mask = _mask(alpha[frame])
         covered[frame] = covered_pixels(poses[frame], corners)
-        targets[frame] = _targets(mask, covered[frame])
-        candidates.extend((frame, strand) for strand in find_strands(mask, covered[frame]))
+        seen = _seen(alpha[frame], covered[frame])
+        targets[frame] = _targets(seen)
+        candidates.extend((frame, strand) for strand in find_strands(seen))
 
     run_parallel([partial(look, frame) for frame in range(len(alpha))])
     candidates.sort(key=lambda one: (one[0] != reference_frame, -len(one[1].points), one[0]))
@@ -146,7 +147,7 @@ def find_strands_again(
 
     def look(frame: int) -> None:
         covered[frame] = covered_pixels(poses[frame], body)
-        targets[frame] = _targets(_mask(alpha[frame]), covered[frame])
+        targets[frame] = _targets(_seen(alpha[frame], covered[frame]))
 
     run_parallel([partial(look, frame) for frame in range(len(alpha))])
     for tube in tubes:
@@ -155,15 +156,14 @@ def find_strands_again(
     return torch.from_numpy(poses[:-1]).to(offsets) - vertices
 
 
-def _mask(alpha: Float[Tensor, "i j"]) -> Bool[np.ndarray, "h w"]:
-    mask: Bool[np.ndarray, "h w"] = enlarged_masks(alpha[None], SIZE)[0].numpy(force=True)
-    return mask
+def _seen(alpha: Float[Tensor, "i j"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
+    return middle_lines(enlarged_masks(alpha[None], SIZE)[0].numpy(force=True), covered)
 
 
-def _targets(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "p 2"]:
+def _targets(lines: MiddleLines) -> Float64[np.ndarray, "p 2"]:
     """Return column and row of the pixels of middle lines that may be strands."""
-    lines, _, radius, corner = middle_lines(mask, covered)
-    targets: Float64[np.ndarray, "p 2"] = np.stack(np.nonzero(lines & (radius <= THICKEST)), 1)[:, ::-1] + corner + 0.5
+    pixels = np.stack(np.nonzero(lines.marks & (lines.radius <= THICKEST)), 1)
+    targets: Float64[np.ndarray, "p 2"] = pixels[:, ::-1] + lines.corner + 0.5
     return targets
 
 
