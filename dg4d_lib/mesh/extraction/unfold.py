@@ -11,7 +11,6 @@ from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighb
 
 ROUNDS = 24  # at most; smoothing also shrinks, which makes new defects in the end, so the best round counts
 WIDER = 6  # rounds after which one more ring of neighbors is smoothed
-PATIENCE = 8  # rounds without fewer defects than ever, after which no more follow
 SWEEPS = 3  # averagings with the neighbors per round
 STEP = 0.5  # share of the way to the mean of the neighbors
 ATTEMPTS, RINGS = 20, 3  # at steps without new defects, and those after which more vertices around these move less
@@ -29,9 +28,9 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     mean_of_neighbors, finder = neighbor_means(edges), DefectFinder(faces)
     smooth = vertices.astype(np.float64)
     defective = finder.defective(smooth)
-    fewest, best, since = defective.sum(), smooth, 0
+    fewest, best = defective.sum(), smooth
     for number in range(ROUNDS - 1):
-        if fewest == 0 or since == PATIENCE:
+        if fewest == 0:
             break
         around = grown(faces_to_vertices(defective, faces, len(smooth)), edges, 1 + number // WIDER)
         here, before = np.flatnonzero(around), smooth
@@ -39,9 +38,8 @@ def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
         for _ in range(SWEEPS):
             smooth[here] += STEP * (means_here @ smooth - smooth[here])
         defective = finder.updated(defective, before, smooth)
-        since += 1
         if defective.sum() < fewest:
-            fewest, best, since = defective.sum(), smooth, 0
+            fewest, best = defective.sum(), smooth
     return best.astype(vertices.dtype)
 
 
