@@ -112,7 +112,7 @@ class DefectFinder:
         return SurfaceDefects(
             faces=len(self._faces),
             self_intersecting=int(self_intersecting(vertices, self._faces).sum()),
-            flipped=int(self.flipped(vertices).sum()),
+            flipped=int(self._flipped(vertices, normals, np.ones(len(self._faces), np.bool_)).sum()),
             folds=int((angles > FOLD_DEG).sum()),
             creases=int((angles > CREASE_DEG).sum()),
             normal_deviation_deg=float(np.sqrt(np.mean(np.square(angles)))) if len(angles) else 0.0,

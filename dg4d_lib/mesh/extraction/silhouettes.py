@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -70,3 +71,12 @@ def cameras_of(frames: int) -> list[list[OrbitCamera]]:
 def enlarged_masks(alpha: Float[Tensor, "t h w"], size: int) -> Bool[Tensor, "t s s"]:
     """Return the masks of a subject at another size, pixels."""
     return interpolate(alpha[:, None], (size, size), mode="bicubic")[:, 0] > ALPHA_THRESHOLD
+
+
+def surroundings(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a mask and so many pixels around it; none if it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    if len(rows) == 0:
+        return slice(0, 0), slice(0, 0)
+    down, across = (slice(max(0, int(at[0]) - margin), int(at[-1]) + 1 + margin) for at in (rows, columns))
+    return down, across

@@ -17,7 +17,7 @@ from skimage.morphology import skeletonize
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.extraction.silhouettes import enlarged_masks
+from dg4d_lib.mesh.extraction.silhouettes import enlarged_masks, surroundings
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -35,6 +35,7 @@ SMOOTH = 4.0  # standard deviation of the middle line along its pixels
 THINNEST = 2.0  # pixels of radius
 TIP = 6  # pixels of the middle line that show where it goes on
 ATTEMPTS = 8  # vertices that a strand may grow out of
+CAMERA = OrbitCamera(width=SIZE, height=SIZE)
 
 
 class Strand(NamedTuple):
@@ -104,41 +105,20 @@ def with_strands(
         alpha: of the subject at the input view.
     """
     mask = enlarged_masks(alpha[None], SIZE)[0].numpy()
-    grown = grow_strands(vertices.double().numpy(), faces.numpy(), mask)
-    return torch.from_numpy(grown.vertices).to(vertices), torch.from_numpy(grown.faces).to(faces)
-
-
-def grow_strands(
-    vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], mask: Bool[np.ndarray, "h w"]
-) -> Grown:
-    """Return a surface with the strands that a mask at the input view shows beyond its outline.
-
-    Args:
-        vertices: welded, world units.
-        faces: counter-clockwise seen from outside.
-        mask: of the subject, `SIZE` pixels.
-    """
-    grown = Grown(vertices, faces)
-    taken = np.zeros(len(vertices), bool)
+    surface = Grown(vertices.double().numpy(), faces.numpy())
     for _ in range(ROUNDS):
-        before = len(grown.tubes)
-        strands = find_strands(middle_lines(mask, covered_pixels(grown.vertices, grown.faces)))
+        before = len(surface.tubes)
+        strands = find_strands(middle_lines(mask, covered_pixels(surface.vertices, surface.faces)))
         for strand in sorted(strands, key=lambda one: -len(one.points))[:MOST]:
-            larger = with_strand(grown, strand, taken)
-            if larger is not None:
-                grown = larger
-                fresh = np.zeros(len(grown.vertices) - len(taken), bool)
-                taken = np.concatenate([taken, fresh])
-                taken[[grown.tubes[-1].tip, *grown.tubes[-1].root]] = True
-        if len(grown.tubes) == before:
+            surface = with_strand(surface, strand) or surface
+        if len(surface.tubes) == before:
             break
-    return grown
+    return torch.from_numpy(surface.vertices).to(vertices), torch.from_numpy(surface.faces).to(faces)
 
 
 def covered_pixels(vertices: Float64[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, "h w"]:
     """Mark the pixels of the input view that a surface covers, of `SIZE` by `SIZE`."""
-    camera = OrbitCamera(width=SIZE, height=SIZE)
-    fragments = rasterize_mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces), [camera])
+    fragments = rasterize_mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces), [CAMERA])
     covered: Bool[np.ndarray, "h w"] = (fragments.faces[0] >= 0).numpy()
     return covered
 
@@ -163,23 +143,14 @@ def find_strands(lines: MiddleLines) -> list[Strand]:
 
 def middle_lines(mask: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
     """Return the middle lines of the parts of a mask that are not covered."""
-    whole = _around(mask, 1)
+    whole = surroundings(mask, 1)
     beyond = ndimage.distance_transform_edt(~covered[whole]) if covered.any() else np.full(mask[whole].shape, np.inf)
     uncovered = mask[whole] & (beyond > NEAR)
-    part = _around(uncovered, MARGIN)
+    part = surroundings(uncovered, MARGIN)
     beyond, here = beyond[part], mask[whole][part]
     marks, radius = skeletonize(here) & (beyond > NEAR), ndimage.distance_transform_edt(here)
     corner = np.array([whole[1].start + part[1].start, whole[0].start + part[0].start])
     return MiddleLines(marks, beyond, radius, corner)
-
-
-def _around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a mask, and some more; none if it is empty."""
-    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    if len(rows) == 0:
-        return slice(0, 0), slice(0, 0)
-    down, across = (slice(max(0, at[0] - margin), at[-1] + 1 + margin) for at in (rows, columns))
-    return down, across
 
 
 def _longest_path(tree: csr_array, root: int) -> list[int]:
@@ -192,22 +163,29 @@ def _longest_path(tree: csr_array, root: int) -> list[int]:
     return path[::-1]
 
 
-def with_strand(grown: Grown, strand: Strand, taken: Bool[np.ndarray, " v"]) -> Grown | None:
-    """Return the surface with a tube, out of a vertex that is not taken; None if no attempt is sound."""
-    vertices, faces = grown.vertices, grown.faces
-    camera = OrbitCamera(width=SIZE, height=SIZE)
-    view = camera.viewmat().numpy()
-    in_camera = vertices @ view[:3, :3].T + view[:3, 3]
-    pixels = in_camera[:, :2] / in_camera[:, 2:] * camera.focal + SIZE / 2
+def pixels_of(points: Float64[np.ndarray, "k 3"]) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
+    """Return column and row of points at the input view, of `SIZE` pixels, and their depth, world units."""
+    view = CAMERA.viewmat().numpy()
+    in_camera = points @ view[:3, :3].T + view[:3, 3]
+    return in_camera[:, :2] / in_camera[:, 2:] * CAMERA.focal + SIZE / 2, in_camera[:, 2]
+
+
+def with_strand(grown: Grown, strand: Strand) -> Grown | None:
+    """Return the surface with a tube that grows out of a vertex where no other does; None if no attempt is sound."""
+    vertices, faces, view = grown.vertices, grown.faces, CAMERA.viewmat().numpy()
+    taken = np.zeros(len(vertices), bool)
+    for tube in grown.tubes:
+        taken[[tube.tip, *tube.root]] = True
+    pixels, depths = pixels_of(vertices)
     distances = np.linalg.norm(pixels - strand.points[0], axis=1) + np.where(taken, np.inf, 0)
     for base in np.argsort(distances)[:ATTEMPTS]:
         root = _ring(faces, int(base))
         if distances[base] > REACH or root is None or taken[root].any():
             continue
-        depth = in_camera[base, 2]
-        flat = (strand.points - SIZE / 2) * depth / camera.focal
+        depth = depths[base]
+        flat = (strand.points - SIZE / 2) * depth / CAMERA.focal
         path = (np.concatenate([flat, np.full((len(flat), 1), depth)], 1) - view[:3, 3]) @ view[:3, :3]
-        larger = _with_tube(grown, int(base), root, path, strand.radii * depth / camera.focal)
+        larger = _with_tube(grown, int(base), root, path, strand.radii * depth / CAMERA.focal)
         new = np.arange(len(larger.faces)) >= (faces != base).all(1).sum()
         if not DefectFinder(larger.faces).defective(larger.vertices, new).any():
             return larger

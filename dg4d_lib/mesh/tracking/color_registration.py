@@ -16,6 +16,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.images import color_over_white, luminance, resize
 from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.mesh.extraction.silhouettes import surroundings
 from dg4d_lib.mesh.extraction.unfold import without_new_defects
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -103,8 +104,7 @@ def _flow(first: Float[np.ndarray, "h w"], second: Float[np.ndarray, "h w"]) -> 
     flow = np.zeros((2, *first.shape))
     shown = np.minimum(first, second) < WHITE
     if shown.any():
-        rows, columns = (np.flatnonzero(shown.any(axis)) for axis in (1, 0))
-        near = tuple(slice(max(0, at[0] - MARGIN), at[-1] + 1 + MARGIN) for at in (rows, columns))
+        near = surroundings(shown, MARGIN)
         flow[:, *near] = optical_flow_tvl1(first[near], second[near], num_warp=WARPS)
     return flow
 

@@ -90,7 +90,7 @@ def relax(
         if silhouettes is not None and left:
             outline = silhouettes[frame, None]
             strong, still_left = body.relaxed(tracked, STRONG)
-            if still_left < left and (_iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS):
+            if still_left < left and _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
                 moved = strong
         relaxed[frame] = torch.from_numpy(moved - body.rest).to(offsets)
 

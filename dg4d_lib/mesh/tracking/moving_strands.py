@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import enlarged_masks
 from dg4d_lib.mesh.extraction.strands import (
+    CAMERA,
     NEAR,
     SIZE,
     THICKEST,
@@ -31,6 +31,7 @@ from dg4d_lib.mesh.extraction.strands import (
     covered_pixels,
     find_strands,
     middle_lines,
+    pixels_of,
     with_strand,
 )
 from dg4d_lib.mesh.neighbors import edge_graph, grown
@@ -50,11 +51,10 @@ USED = 8.0  # pixels around a strand whose middle lines no other one takes
 
 Vertices = Float64[np.ndarray, "v 3"]
 Poses = Float64[np.ndarray, "p v 3"]  # of the frames, and of the rest shape
-CAMERA = OrbitCamera(width=SIZE, height=SIZE)
 
 
 class Fit(NamedTuple):
-    """Where a frame shows a strand.
+    """Result of the search for a strand in one frame.
 
     Attributes:
         line: column and row of its points; None if it is not shown.
@@ -98,24 +98,22 @@ def grow_moving_strands(
     run_parallel([partial(look, frame) for frame in range(len(alpha))])
     candidates.sort(key=lambda one: (one[0] != reference_frame, -len(one[1].points), one[0]))
     tubes: tuple[Tube, ...] = ()
-    taken, tries = np.zeros(len(vertices), bool), 0
+    tries = 0
     for frame, strand in candidates:
         if tries == TRIED:
             break
         if len(targets[frame]) == 0 or _near(strand.points, targets[frame], USED / 2).mean() < NEW:
             continue
         tries += 1
-        larger = with_strand(Grown(poses[frame], corners, tubes), strand, taken)
+        larger = with_strand(Grown(poses[frame], corners, tubes), strand)
         if larger is None:
             continue
-        moved = np.concatenate([poses, np.repeat(larger.vertices[None, len(taken) :], len(poses), 0)], 1)
+        moved = np.concatenate([poses, np.repeat(larger.vertices[None, poses.shape[1] :], len(poses), 0)], 1)
         moved, lines, shown = _followed(larger.vertices, larger.faces, larger.tubes[-1], moved, targets, covered)
         if shown < SEEN:
             continue
         moved[frame] = larger.vertices
         poses, corners, tubes = moved, larger.faces, larger.tubes
-        taken = np.append(taken, np.zeros(len(larger.vertices) - len(taken), bool))
-        taken[[tubes[-1].tip, *tubes[-1].root]] = True
         targets = _without(targets, lines)
     if not tubes:
         return vertices, offsets, faces, ()
@@ -157,6 +155,7 @@ def find_strands_again(
 
 
 def _seen(alpha: Float[Tensor, "i j"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
+    """Return the middle lines of what the surface does not cover of a frame."""
     return middle_lines(enlarged_masks(alpha[None], SIZE)[0].numpy(force=True), covered)
 
 
@@ -241,14 +240,14 @@ def _followed(
 
 def _line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:
     """Return column and row of the middle line of a strand, and those of its root."""
-    return _pixels(_centers(pose, tube))[0], _pixels(pose[tube.root].mean(0, keepdims=True))[0]
+    return pixels_of(_centers(pose, tube))[0], pixels_of(pose[tube.root].mean(0, keepdims=True))[0]
 
 
 def _place(shape: Vertices, pose: Vertices, tube: Tube, line: Float64[np.ndarray, "k 2"]) -> None:
     """Move a strand to a line in the picture, at the depth that it has; its rings are those of the shape, turned."""
     centers = _centers(pose, tube)
-    step = line - _pixels(centers)[0]
-    after = centers + step * _pixels(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
+    step = line - pixels_of(centers)[0]
+    after = centers + step * pixels_of(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
     before = _centers(shape, tube)
     directions = zip(_directions(shape, tube, before), _directions(pose, tube, after), strict=True)
     turns = [Rotation.align_vectors(to[None], along[None])[0] for along, to in directions]
@@ -267,13 +266,6 @@ def _directions(pose: Vertices, tube: Tube, centers: Float64[np.ndarray, "k 3"])
     root = pose[tube.root].mean(0, keepdims=True)
     directions: Float64[np.ndarray, "k 3"] = np.gradient(np.concatenate([root, centers]), axis=0)[1:]
     return directions
-
-
-def _pixels(points: Float64[np.ndarray, "k 3"]) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
-    """Return column and row of points, and their depth."""
-    view = CAMERA.viewmat().numpy()
-    in_camera = points @ view[:3, :3].T + view[:3, 3]
-    return in_camera[:, :2] / in_camera[:, 2:] * CAMERA.focal + SIZE / 2, in_camera[:, 2]
 
 
 def _turned(

@@ -24,7 +24,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
-from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, enlarged_masks
+from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD, enlarged_masks, surroundings
 from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.fairing import LowPass, bump_filter
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
@@ -75,11 +75,10 @@ def outline_of(mask: Bool[np.ndarray, "h w"]) -> Outline:
 
 def _cropped(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[int, int, Bool[np.ndarray, "i j"]]:
     """Return first row, first column and content of the part of a mask that is not empty, with a margin."""
-    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    if len(rows) == 0:
+    if not mask.any():
         return 0, 0, mask[:2, :2]
-    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
-    return top, left, mask[top : rows[-1] + margin + 1, left : columns[-1] + margin + 1]
+    rows, columns = surroundings(mask, margin)
+    return rows.start, columns.start, mask[rows, columns]
 
 
 def register_to_outlines(
