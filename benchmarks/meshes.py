@@ -1,16 +1,18 @@
 """Defects of packaged meshes, at rest and in every frame: crossings, flips, folds, creases, handles; and their atlas.
 
 Run with `python -m benchmarks.meshes PACKAGE ...` (`--json FILE` keeps the rows of the first table). A mesh per frame
-has no rest shape: its frames are counted one by one, and nothing is flipped.
+has no rest shape: its frames are counted one by one, and nothing is flipped. Of several packages, the last rows are the
+means.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from benchmarks.measure import new_console, parser_of, write_rows
 
-import torch  # isort: skip
+import numpy as np  # isort: skip
+import torch
 from rich.table import Table
 
 from dg4d_lib.assets.animated import Asset4D
@@ -21,7 +23,7 @@ from dg4d_lib.mesh.texturing.atlas_quality import AtlasQuality, atlas_quality
 from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import mesh_at, read_surface
 
-PERCENT = 100
+PERCENT, EDGES = 100, 1.5  # edges per triangle of a closed surface
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Row:
 
     Attributes:
         package: name of the folder.
-        moment: "rest", or "frames": the worst of all frames in each column.
+        moment: "rest", "mean" of all frames, or "worst": of all frames, in each column.
         triangles: number of triangles.
         crossing: triangles that cross others.
         flipped: triangles that turned over.
@@ -42,13 +44,13 @@ class Row:
 
     package: str
     moment: str
-    triangles: int
+    triangles: float
     crossing: float
     flipped: float
     folds: float
     creases: float
     deviation_deg: float
-    genus: int
+    genus: float
 
 
 def main() -> None:
@@ -56,6 +58,8 @@ def main() -> None:
     parser.add_argument("packages", type=Path, nargs="+", help="folders of unpacked packages")
     options = parser.parse_args()
     rows = [row for folder in options.packages for row in measure(folder)]
+    if len(options.packages) > 1:
+        rows += [mean_row([row for row in rows if row.moment == moment]) for moment in ("mean", "worst")]
     console = new_console()
     console.print(table(rows))
     console.print(atlas_table({folder.name: measure_atlas(folder) for folder in options.packages}))
@@ -70,9 +74,18 @@ def measure(folder: Path) -> Iterator[Row]:
     if isinstance(surface, Asset4D):
         joined, faces = join_seams(surface.mesh.vertices.numpy(), surface.mesh.faces.numpy())
         rest = surface.mesh.vertices.numpy()[joined]
-        yield _row(folder.name, "rest", [surface_defects(rest, faces)], genus(faces))
+        yield _row(folder.name, "rest", [surface_defects(rest, faces)], [genus(faces)], max)
     frames = [_frame(surface, float(frame)) for frame in range(manifest.frames)]
-    yield _row(folder.name, "frames", [defects for defects, _ in frames], max(handles for _, handles in frames))
+    defects, handles = [list(column) for column in zip(*frames, strict=True)]
+    yield _row(folder.name, "mean", defects, handles, np.mean)
+    yield _row(folder.name, "worst", defects, handles, max)
+
+
+def mean_row(rows: list[Row]) -> Row:
+    """Return the means of the rows of several packages."""
+    names = [field.name for field in fields(Row)][2:]
+    means = {name: float(np.mean([getattr(row, name) for row in rows])) for name in names}
+    return Row("mean", rows[0].moment, **means)
 
 
 def table(rows: list[Row]) -> Table:
@@ -83,7 +96,8 @@ def table(rows: list[Row]) -> Table:
         shown.add_column(name, justify="left" if name in {"package", "moment"} else "right")
     for row in rows:
         shares = (f"{share:.3f}" for share in (row.crossing, row.flipped, row.folds, row.creases))
-        shown.add_row(row.package, row.moment, str(row.triangles), *shares, f"{row.deviation_deg:.1f}", str(row.genus))
+        rest = (f"{row.deviation_deg:.1f}", f"{row.genus:g}")
+        shown.add_row(row.package, row.moment, f"{row.triangles:.0f}", *shares, *rest)
     return shown
 
 
@@ -122,19 +136,26 @@ def _frame(surface: Surface, position: float) -> tuple[SurfaceDefects, int]:
     return surface_defects(mesh.vertices.numpy()[joined], faces, rest.numpy()[joined]), genus(faces)
 
 
-def _row(package: str, moment: str, found: list[SurfaceDefects], handles: int) -> Row:
-    triangles = min(defects.faces for defects in found)
-    edges = 1.5 * triangles / PERCENT
+def _row(
+    package: str,
+    moment: str,
+    found: list[SurfaceDefects],
+    handles: list[int],
+    reduce: Callable[[Sequence[float]], float],
+) -> Row:
+    def share(name: str, of: float) -> float:
+        return float(reduce([getattr(defects, name) * PERCENT / (of * defects.faces) for defects in found]))
+
     return Row(
         package,
         moment,
-        triangles,
-        crossing=max(defects.self_intersecting for defects in found) * PERCENT / triangles,
-        flipped=max(defects.flipped for defects in found) * PERCENT / triangles,
-        folds=max(defects.folds for defects in found) / edges,
-        creases=max(defects.creases for defects in found) / edges,
-        deviation_deg=max(defects.normal_deviation_deg for defects in found),
-        genus=handles,
+        float(reduce([defects.faces for defects in found])),
+        crossing=share("self_intersecting", 1),
+        flipped=share("flipped", 1),
+        folds=share("folds", EDGES),
+        creases=share("creases", EDGES),
+        deviation_deg=float(reduce([defects.normal_deviation_deg for defects in found])),
+        genus=float(reduce(handles)),
     )
 
 

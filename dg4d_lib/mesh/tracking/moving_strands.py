@@ -2,6 +2,7 @@
 
 Tracking loses what is a pixel wide, so the mesh is tracked without strands. In every frame, a strand is shifted by the
 surface around its root first, and then turns, stretches and bends to the middle lines that the picture shows there.
+How far it comes towards the camera no picture tells: of some slopes, it gets the one at which it crosses the least.
 A strand that most frames do not show is none: seen from the side, wings and hands are lines, too.
 """
 
@@ -34,6 +35,7 @@ from dg4d_lib.mesh.extraction.strands import (
     pixels_of,
     with_strand,
 )
+from dg4d_lib.mesh.folds import self_intersecting
 from dg4d_lib.mesh.neighbors import edge_graph, grown
 
 TRIED = 40  # strands of single frames, the longest first, at most
@@ -47,6 +49,8 @@ SHOWN = 0.4  # share of its points that the surface must not cover there
 SEEN = 0.5  # share of the frames that must show it
 STIFF = (3.0, 3.0, 2.0, 2.0, 1.0, 1.0)  # standard deviation of the steps of bending along the rings, by rounds
 SHARP = 0.5  # cosine between steps of a tracked line below which tracking has lost it
+SLOPES = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, -1.5, 1.5)  # of depth along a strand that are tried
+GENTLE = 4.0  # crossing faces per frame that a slope of 1 must save
 USED = 8.0  # pixels around a strand whose middle lines no other one takes
 
 Vertices = Float64[np.ndarray, "v 3"]
@@ -113,7 +117,8 @@ def grow_moving_strands(
         if shown < SEEN:
             continue
         moved[frame] = larger.vertices
-        poses, corners, tubes = moved, larger.faces, larger.tubes
+        corners, tubes = larger.faces, larger.tubes
+        poses = _sloped(moved, corners, tubes, len(tubes) - 1)
         targets = _without(targets, lines)
     if not tubes:
         return vertices, offsets, faces, ()
@@ -148,8 +153,9 @@ def find_strands_again(
         targets[frame] = _targets(_seen(alpha[frame], covered[frame]))
 
     run_parallel([partial(look, frame) for frame in range(len(alpha))])
-    for tube in tubes:
+    for index, tube in enumerate(tubes):
         poses, lines, _ = _followed(poses[-1], corners, tube, poses, targets, covered, known=True)
+        poses = _sloped(poses, corners, tubes, index)
         targets = _without(targets, lines)
     return torch.from_numpy(poses[:-1]).to(offsets) - vertices
 
@@ -236,6 +242,33 @@ def _followed(
         lines[frame] = _turned(line, root, np.array([turn]), np.array([scale]))[0] if fit.line is None else fit.line
         _place(shape, moved[frame], tube, lines[frame])
     return moved, lines, len(shown) / len(targets)
+
+
+def _sloped(poses: Poses, faces: Int[np.ndarray, "f 3"], tubes: Sequence[Tube], index: int) -> Poses:
+    """Return all poses with a strand in the slope, the same in all, at which it crosses few faces (`GENTLE`)."""
+    own = np.zeros(poses.shape[1], bool)
+    own[_own(tubes[index])] = True
+    near, eye = own[faces].any(1), CAMERA.position().numpy()
+    shifts = np.zeros_like(poses)
+    for pose, shift in zip(poses, shifts, strict=True):
+        tube = tubes[index]
+        middle = np.concatenate([pose[tube.root].mean(0, keepdims=True), _centers(pose, tube)])
+        lengths = np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum()
+        rays = pose[_own(tube)] - eye
+        shift[_own(tube)] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        shift[_own(tube)] *= np.append(np.repeat(lengths[:-1], len(tube.root)), lengths[-1])[:, None]
+        for later in tubes[index + 1 :]:
+            shift[_own(later)] += shift[later.root].mean(0)  # strands that grew out of it go with it
+    counts = np.zeros((len(SLOPES), len(poses)), np.int64)
+
+    def count(pose: int) -> None:
+        for row, slope in zip(counts, SLOPES, strict=True):
+            row[pose] = self_intersecting(poses[pose] + slope * shifts[pose], faces, near).sum()
+
+    run_parallel([partial(count, pose) for pose in range(len(poses))])
+    best = (counts.mean(1) + GENTLE * np.abs(SLOPES)).argmin()
+    sloped: Poses = poses + SLOPES[best] * shifts
+    return sloped
 
 
 def _line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:

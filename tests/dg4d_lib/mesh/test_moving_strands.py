@@ -6,7 +6,7 @@ import trimesh
 from skimage.draw import line
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.folds import genus
+from dg4d_lib.mesh.folds import genus, self_intersecting
 from dg4d_lib.mesh.tracking.moving_strands import find_strands_again, grow_moving_strands
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -71,6 +71,28 @@ def test_a_swinging_leg_is_followed() -> None:
     assert torch.allclose(moved[:, : len(vertices)][:, body], offsets[:, body], atol=1e-6)
     rods = (grown + moved)[:, tubes[0].rings.ravel()]
     assert float(rods[..., 2].std(1).max()) < 0.05  # parallel to the picture
+
+
+def test_a_leg_slopes_towards_the_camera_or_away_to_pass_a_plate() -> None:
+    vertices, offsets, faces, alpha = walking_ball((0, 1, 2, 3))
+    grown, moved, corners, tubes = grow_moving_strands(vertices, offsets, faces, alpha, 0)
+    middle = grown[tubes[0].rings].mean(1).numpy()
+    place, along = middle[2 * len(middle) // 3], middle[-1] - middle[0]
+    ray = OrbitCamera().position().numpy() - place
+    axes = np.linalg.qr(np.stack([ray, along], 1), "complete")[0]  # along the ray, along the strand, across both
+    plate = trimesh.creation.box((0.16, 0.008, 0.4)).subdivide().subdivide().subdivide()
+    plate.apply_transform(np.block([[axes, place[:, None]], [0, 0, 0, 1]]))
+    together = torch.cat([grown, torch.from_numpy(plate.vertices.astype(np.float32))])
+    carried = torch.cat([moved, moved[:, :1].expand(-1, len(plate.vertices), -1)], 1)
+    every = torch.cat([corners, len(grown) + torch.from_numpy(plate.faces.astype(np.int32))])
+
+    def crossing(offsets: torch.Tensor) -> list[int]:
+        poses = (together + offsets).numpy()
+        return [int(self_intersecting(pose, every.numpy())[len(corners) :].sum()) for pose in poses]
+
+    found = find_strands_again(together, carried, every, tubes, alpha)
+    assert sum(crossing(carried)) > 20 and sum(crossing(found)) == 0
+    assert min(shares(together, found, every, alpha)) > 0.7
 
 
 def test_where_a_leg_is_hidden_it_goes_on_between_its_neighbors() -> None:
