@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D, pose_gaussians
 from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
-from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
+from dg4d_lib.assets.formats.rigged import PRECISE, fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
@@ -117,7 +118,11 @@ class PackageWriter:
             rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error)
             notes = (note,)
         if isinstance(surface, Asset4D) and rig is not None:
-            self.path(packages.RIGGED).write_bytes(write_rigged_glb(surface, rig, pack.gltf))
+            precise = rig.rms <= PRECISE * self.placement.scale
+            path = self.path(packages.RIGGED if precise else packages.PLAYBACK)
+            path.write_bytes(write_rigged_glb(surface, rig, pack.gltf))
+            if not precise:
+                notes = (f"{note}; it is for playback, in {path.name}, and asset.glb is exact",)
             if pack.usd:
                 write_skinned_usdz(self.path(packages.USD), surface, rig, about, pack.gltf)
         elif pack.usd:
@@ -151,8 +156,8 @@ class PackageWriter:
         write_mp4(self.path(packages.DRIVING), self.video.over(torch.ones(3))[:, :even, :even], self.video.fps)
 
     def write_preview(self) -> Sequence[str]:
-        """Write the film of the motion with a camera that goes round."""
-        return write_preview(self.path(packages.PREVIEW), *self._motion)
+        """Write the film of the motion, as splats and as a lit mesh, with a camera that goes round."""
+        return write_preview(self.path(packages.PREVIEW), *self._motion, mesh_at=self._mesh_at_frame)
 
     def write_moving_picture(self) -> None:
         """Write the same as a small animated WebP for web pages."""
@@ -177,9 +182,14 @@ class PackageWriter:
         )
         write_png(self.path(packages.SHEET), sheet)
 
-    def _mesh_at_frame(self, frame: int) -> TexturedMesh:
+    @cached_property
+    def _fitted_surface(self) -> Surface:
+        """Surface as it was fitted."""
+        return self.placement.inverse.surface(self.surface)
+
+    def _mesh_at_frame(self, frame: float) -> TexturedMesh:
         """Return the mesh, as it was fitted, at a frame of the driving video, which may have another rate."""
-        surface = self.placement.inverse.surface(self.surface)
+        surface = self._fitted_surface
         frames = len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
         return mesh_at(surface, torch.tensor(frame * frames / len(self.video), dtype=torch.float64))
 

@@ -1,14 +1,20 @@
 """Sets of viewpoints: random orbits for score distillation, fixed sets for baking and turntables."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 
 BAKING_ELEVATIONS_DEG = (0.0, -45.0, 45.0)
 PLASTIC = 1.324717957244746  # real root of x^3 = x + 1
+SHOWN, MARGIN = 0.999, 0.06  # share of the points that widened pictures hold, and their borders, in half sides
+PROBES = 24  # cameras that are looked through for it, at most
+NEAREST = 0.5  # depth that nearer points count as, world units
 POLE_DEG = 89.9  # elevation of the polar views; at exactly 90 the up vector is undefined
 
 
@@ -62,6 +68,25 @@ def spread_orbit(
 def turntable(count: int, camera: OrbitCamera) -> list[OrbitCamera]:
     """Return `count` copies of a camera at equal steps of azimuth, the given azimuth first."""
     return [replace(camera, azimuth_deg=camera.azimuth_deg + 360 * i / count) for i in range(count)]
+
+
+def widened(cameras: Sequence[OrbitCamera], points: Float[Tensor, "t p 3"]) -> list[OrbitCamera]:
+    """Return the cameras with one field of view: the least from theirs on that shows each of them nearly all points.
+
+    What comes nearer to a camera than the input view saw it may not fit into the picture.
+
+    Args:
+        cameras: with square pictures, all of one field of view. Of many, some are looked through.
+        points: at every frame, world units; a few strays among those of a frame (`SHOWN`) are not waited for.
+    """
+    widest = max(camera.tan_half_fov[1] for camera in cameras)
+    for camera in cameras[:: -(-len(cameras) // PROBES)] if points.numel() else ():
+        view = camera.viewmat().to(points.device)
+        seen = points.double() @ view[:3, :3].T + view[:3, 3]
+        tangents = seen[..., :2].abs().amax(-1) / seen[..., 2].clamp_min(NEAREST)
+        widest = max(widest, float(tangents.quantile(SHOWN, 1).max()) * (1 + MARGIN))
+    fov_y_deg = math.degrees(2 * math.atan(widest))
+    return [replace(camera, fov_y_deg=max(fov_y_deg, camera.fov_y_deg)) for camera in cameras]
 
 
 def baking_views(size: int) -> list[OrbitCamera]:

@@ -13,61 +13,82 @@ from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
-from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
+from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
 
-SUPERSAMPLING = 3  # samples per pixel along each axis; odd, so that no pixel is covered by exactly half
+SUPERSAMPLING = 3  # samples per pixel along each axis, unless told; odd, so that no pixel is covered by exactly half
 LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera's axes (x right, y down, z forward)
 AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its color
 
 
 def render_mesh(
-    mesh: TexturedMesh, cameras: Sequence[OrbitCamera], offsets: Float[Tensor, "*b v 3"] | None = None
+    mesh: TexturedMesh,
+    cameras: Sequence[OrbitCamera],
+    offsets: Float[Tensor, "*b v 3"] | None = None,
+    supersampling: int = SUPERSAMPLING,
 ) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-    """Render color and alpha of a mesh with nine samples per pixel; differentiable in the texture.
+    """Render color and alpha of a mesh with several samples per pixel; differentiable in the texture.
 
     Args:
         mesh: the mesh at rest.
         cameras: b cameras of equal width and height.
         offsets: added to the vertices, world units; the same for all cameras ("v 3") or one state per camera ("b v 3").
+        supersampling: samples per pixel along each axis.
 
     Returns:
-        Straight color in [0, 1] (0 where alpha is 0) and alpha in ninths.
+        Straight color in [0, 1] (0 where alpha is 0) and alpha: the share of the samples that show the mesh.
 
     Raises:
         BadInput: no cameras, cameras of different sizes, or a number of mesh states that differs from the number of
             cameras.
     """
-    fine = [
-        replace(camera, width=SUPERSAMPLING * camera.width, height=SUPERSAMPLING * camera.height) for camera in cameras
-    ]
     vertices = mesh.vertices if offsets is None else mesh.vertices + offsets
-    fragments = rasterize_mesh(vertices, mesh.faces, fine)
-    lookup = build_lookup(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
-    samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
-    samples[lookup.covered] = sample_texture(mesh.texture, lookup)
-    color, alpha = _pooled(samples), _pooled(lookup.covered[..., None].to(samples))
-    return color / alpha.clamp_min(0.5 / SUPERSAMPLING**2), alpha
+    fragments, samples = _samples(mesh, vertices, cameras, supersampling)
+    return _pooled(samples, fragments, supersampling)
 
 
-def render_lit(mesh: TexturedMesh, camera: OrbitCamera) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
+def render_lit(
+    mesh: TexturedMesh, camera: OrbitCamera, supersampling: int = SUPERSAMPLING
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
     """Render a mesh under one distant light and ambient light, with smooth normals; folds and dents show.
+
+    Args:
+        mesh: the mesh.
+        camera: the camera.
+        supersampling: samples per pixel along each axis.
 
     Returns:
         Straight color and alpha, in [0, 1].
     """
-    color, alpha = render_mesh(mesh, [camera])
-    fragments = rasterize_mesh(mesh.vertices, mesh.faces, [camera])
-    shown = normalize(interpolate(fragments, mesh.faces, smooth_normals(mesh)), dim=-1)
-    light = normalize(torch.tensor(LIGHT), dim=0).to(shown)
-    cosine = ((shown @ camera.viewmat()[:3, :3].to(shown).T) * light).sum(-1, keepdim=True).clamp_min(0)
-    return (color * (AMBIENT + DIFFUSE * cosine)).clamp(0, 1)[0], alpha[0]
+    fragments, samples = _samples(mesh, mesh.vertices, [camera], supersampling)
+    towards = normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0) @ camera.viewmat()[:3, :3]
+    cosines = (smooth_normals(mesh) @ towards.to(mesh.vertices)).clamp_min(0)
+    lit = samples * interpolate(fragments, mesh.faces, AMBIENT + DIFFUSE * cosines[:, None])
+    color, alpha = _pooled(lit.clamp(0, 1), fragments, supersampling)
+    return color[0], alpha[0]
+
+
+def _samples(
+    mesh: TexturedMesh, vertices: Float[Tensor, "*b v 3"], cameras: Sequence[OrbitCamera], side: int
+) -> tuple[Fragments, Float[Tensor, "b i j 3"]]:
+    """Return what the samples of finer pixels show, and their colors; 0 where there is nothing."""
+    fine = [replace(camera, width=side * camera.width, height=side * camera.height) for camera in cameras]
+    fragments = rasterize_mesh(vertices, mesh.faces, fine)
+    lookup = build_lookup(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
+    samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
+    samples[lookup.covered] = sample_texture(mesh.texture, lookup)
+    return fragments, samples
+
+
+def _pooled(
+    samples: Float[Tensor, "b i j 3"], fragments: Fragments, side: int
+) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    """Return straight color and alpha of pixels from those of their samples."""
+    covered = (fragments.faces >= 0)[..., None].to(samples)
+    color, alpha = (avg_pool2d(each.movedim(-1, 1), side).movedim(1, -1) for each in (samples, covered))
+    return color / alpha.clamp_min(0.5 / side**2), alpha
 
 
 def smooth_normals(mesh: TexturedMesh) -> Float[Tensor, "v 3"]:
     """Return area-weighted unit normals, equal on both sides of texture seams."""
     first, position = map(torch.from_numpy, group_vertices(mesh.vertices.numpy()))
     return vertex_normals(mesh.vertices[first], position[mesh.faces.long()])[position]
-
-
-def _pooled(values: Float[Tensor, "b h w c"]) -> Float[Tensor, "b i j c"]:
-    return avg_pool2d(values.movedim(-1, 1), SUPERSAMPLING).movedim(1, -1)

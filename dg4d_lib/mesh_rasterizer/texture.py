@@ -13,11 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, grid_sample
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.mesh_rasterizer import texture_cpu
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments
 
 
@@ -67,19 +68,12 @@ def build_lookup(
         cameras: the b cameras of the fragments.
         fragments: output of the rasterizer.
     """
-    covered, indices, texels = fragments.faces >= 0, faces.long(), uvs.new_tensor((size[1], size[0]))
-    pixel_uvs, levels = [], []
-    for view, camera in enumerate(cameras):
-        seen, state = covered[view], vertices if vertices.ndim == 2 else vertices[view]
-        corners = indices[fragments.faces[view][seen].long()]
-        corner_uvs = uvs[corners].double()
-        uv = (fragments.barycentrics[view][seen][..., None].double() * corner_uvs).sum(1)
-        sides = _uv_slopes(state.detach(), camera, corners, seen, corner_uvs - uv[:, None]) * texels
-        pixel_uvs.append(uv.float())
-        levels.append(0.5 * (sides.square().sum((1, 2)) / 2 / 3).log2())
+    covered = fragments.faces >= 0
+    places = texture_cpu.texture_places if vertices.device.type == "cpu" else texture_places
+    uv, level = places(vertices, faces, uvs, size, cameras, fragments)
     coarsest = (max(size) - 1).bit_length()  # level of a single texel
-    level = torch.cat(levels).nan_to_num(0).clamp(0, coarsest)  # NaN in edge-on triangles
-    return TextureLookup(covered, tuple(_taps(torch.cat(pixel_uvs), level.float())))
+    level = level.nan_to_num(0).clamp(0, coarsest)  # NaN in edge-on triangles
+    return TextureLookup(covered, tuple(_taps(uv, level)))
 
 
 def sample_texture(texture: Float[Tensor, "h w c"], lookup: TextureLookup) -> Float[Tensor, "p c"]:
@@ -94,6 +88,28 @@ def sample_bilinear(image: Float[Tensor, "h w c"], uvs: Float[Tensor, "n 2"]) ->
     """Sample an image bilinearly at coordinates in [0, 1], u right and v down; clamped at the border."""
     grid = (2 * uvs - 1).to(image)[None, None]
     return grid_sample(image.movedim(-1, 0)[None], grid, align_corners=False, padding_mode="border")[0, :, 0].T
+
+
+def texture_places(
+    vertices: Float[Tensor, "*b v 3"],
+    faces: Int[Tensor, "f 3"],
+    uvs: Float[Tensor, "v 2"],
+    size: Sequence[int],
+    cameras: Sequence[OrbitCamera],
+    fragments: Fragments,
+) -> tuple[Float32[Tensor, "p 2"], Float32[Tensor, " p"]]:
+    """Return texture coordinates and mip levels of all covered pixels; arguments are those of `build_lookup`."""
+    covered, indices, texels = fragments.faces >= 0, faces.long(), uvs.new_tensor((size[1], size[0]))
+    pixel_uvs, levels = [], []
+    for view, camera in enumerate(cameras):
+        seen, state = covered[view], vertices if vertices.ndim == 2 else vertices[view]
+        corners = indices[fragments.faces[view][seen].long()]
+        corner_uvs = uvs[corners].double()
+        uv = (fragments.barycentrics[view][seen][..., None].double() * corner_uvs).sum(1)
+        sides = _uv_slopes(state.detach(), camera, corners, seen, corner_uvs - uv[:, None]) * texels
+        pixel_uvs.append(uv.float())
+        levels.append((0.5 * (sides.square().sum((1, 2)) / 2 / 3).log2()).float())
+    return torch.cat(pixel_uvs), torch.cat(levels)
 
 
 def _uv_slopes(
@@ -125,10 +141,10 @@ def _uv_slopes(
 
 
 def _taps(uvs: Float[Tensor, "p 2"], levels: Float[Tensor, " p"]) -> Iterator[Taps]:
-    for level in range(int(levels.max().ceil()) + 1 if len(levels) else 0):
-        weights = 1 - (levels - level).abs()
-        pixels = (weights > 0).nonzero()[:, 0]
-        yield Taps(pixels, uvs[pixels], weights[pixels])
+    lower, upper = (rounded.to(torch.int8) for rounded in (levels.floor(), levels.ceil()))
+    for level in range(int(upper.max()) + 1 if len(levels) else 0):
+        pixels = ((lower == level) | (upper == level)).nonzero()[:, 0]
+        yield Taps(pixels, uvs[pixels], 1 - (levels[pixels] - level).abs())
 
 
 def _mip_levels(texture: Float[Tensor, "h w c"]) -> Iterator[Float[Tensor, "i j c"]]:
@@ -136,4 +152,6 @@ def _mip_levels(texture: Float[Tensor, "h w c"]) -> Iterator[Float[Tensor, "i j 
     mip = texture.movedim(-1, 0)
     while True:
         yield mip.movedim(0, -1)
-        mip = adaptive_avg_pool2d(mip, (-(-mip.shape[1] // 2), -(-mip.shape[2] // 2)))
+        height, width = mip.shape[1:]
+        even = height % 2 == width % 2 == 0
+        mip = avg_pool2d(mip, 2) if even else adaptive_avg_pool2d(mip, (-(-height // 2), -(-width // 2)))

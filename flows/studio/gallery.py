@@ -31,7 +31,8 @@ THUMBNAIL_SIZES, THUMBNAIL_QUALITIES, THUMBNAIL_BYTES = (384, 256, 128), (80, 60
 PICTURES = ("preview.webp", "contact_sheet.png")  # of a package, the first that is there
 DAYS = {"day": 1, "week": 7, "month": 30}
 DOWNLOADS = (  # files of a package that are offered one by one
-    "asset.glb", "asset_rigged.glb", "asset.usdz", "preview.mp4", "turntable.mp4", "preview.webp", "contact_sheet.png",
+    "asset.glb", "asset_rigged.glb", "asset_playback.glb", "asset.usdz", "preview.mp4", "turntable.mp4", "preview.webp",
+    "contact_sheet.png",
 )  # fmt: skip
 _versions: dict[tuple[str, float], Version | None] = {}  # by name and time of the record
 

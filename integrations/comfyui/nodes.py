@@ -24,6 +24,7 @@ MOST_SEED = 2**53 - 1  # integers that JavaScript keeps
 FORMATS = {  # files of the package, and the suffix of one file or of those in a folder
     "GLB": ("asset.glb", ".glb"),
     "GLB with skeleton": ("asset_rigged.glb", ".glb"),
+    "GLB with skeleton, for playback": ("asset_playback.glb", ".glb"),
     "USDZ": ("asset.usdz", ".usdz"),
     "splats (PLY)": ("splats/*.ply", ".ply"),
     "splats (SPZ)": ("splats/*.spz", ".spz"),

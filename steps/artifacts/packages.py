@@ -14,6 +14,7 @@ MANIFEST = "asset.json"
 ASSET = "asset.glb"
 MERGED = "asset_merged.glb"
 RIGGED = "asset_rigged.glb"
+PLAYBACK = "asset_playback.glb"
 USD = "asset.usdz"
 USD_SPLATS = "asset_splats.usdz"
 SPLATS = "splats"
@@ -33,6 +34,7 @@ ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
     MERGED: "the user's model, animated, as one mesh with one texture, glTF 2.0",
     RIGGED: "the same mesh on a skeleton, glTF 2.0",
+    PLAYBACK: "the same mesh on a skeleton that follows the motion roughly, glTF 2.0",
     USD: "animated mesh, on a skeleton if one follows the motion, USDZ",
     USD_SPLATS: "moving splats, and as a variant point samples of the mesh, USDZ",
     WEB_SPLATS: "moving splats for the viewer",

@@ -21,6 +21,7 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
+from steps import pack_asset
 from steps.artifacts.archives import EPOCH
 from steps.artifacts.media import read_png
 from steps.artifacts.meshes import write_tracked
@@ -68,6 +69,13 @@ def files(folder: Path) -> set[str]:
 
 def test_a_tracked_package_is_complete(package: Path) -> None:
     assert files(package) == COMMON | SPLATS | RIGGED
+
+
+def test_a_rig_that_misses_the_motion_is_for_playback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pack_asset, "PRECISE", -1.0)
+    folder = packed(tmp_path)
+    assert files(folder) == COMMON | SPLATS | {"asset_playback.glb"}
+    assert any("in asset_playback.glb, and asset.glb is exact" in note for note in read_manifest(folder).notes)
 
 
 def test_a_package_of_a_mesh_per_frame_is_complete(per_frame: Path) -> None:

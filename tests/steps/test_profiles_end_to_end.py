@@ -19,7 +19,7 @@ from tiny_weights import write_zero123
 from dg4d_lib.diffusion.view_drawing import ViewDrawer
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.weights.registry import KNOWN
-from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, RIGGED, SPLATS
+from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, PLAYBACK, RIGGED, SPLATS
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.profiles import PROFILES, PipelineSettings, profile, revise, step_settings
@@ -70,7 +70,7 @@ WRITERS = {
     "qwen-image-edit-2511": save_tiny_qwen_edit,
     "qwen-multiple-angles": save_tiny_lora,
 }
-ALWAYS = {MANIFEST, *ABOUT} - {RIGGED, MERGED}
+ALWAYS = {MANIFEST, *ABOUT} - {RIGGED, PLAYBACK, MERGED}
 
 
 @dataclass
@@ -205,7 +205,7 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
         names, manifest = set(files.namelist()), json.loads(files.read(MANIFEST))
         assert files.read(ASSET).startswith(b"glTF")
     per_frame = name != "quality"
-    assert names - {RIGGED} == {
+    assert names - {RIGGED, PLAYBACK} == {
         *ALWAYS,
         *(f"{SPLATS}/{frame:03d}.{form}" for frame in range(FRAMES) for form in ("ply", "spz")),
         *(f"{MESHES}/{frame:03d}.glb" for frame in range(FRAMES * per_frame)),

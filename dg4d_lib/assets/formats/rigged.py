@@ -20,6 +20,7 @@ from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
 TARGET_ERROR = 0.05  # share of the motion; no bones are added below it, as the rest is hardly visible
+PRECISE = 0.004  # root mean square miss of a rig that can stand for the morph targets, world units of the fit
 RIGID = 0.02  # change of a bone's length below which it counts as constant
 STILL = 1e-5  # change of a translation below which it gets no channel, relative to the largest coordinate
 MAX_BONES = 255  # joint indices are bytes

@@ -1,10 +1,10 @@
-"""Preview videos: an animated asset with an orbiting camera, or a turntable of a static one."""
+"""Preview videos: an animated asset with an orbiting camera, its lit mesh beside it, or a turntable of a static one."""
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from math import ceil
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import av
 import torch
@@ -15,16 +15,20 @@ from torch import Tensor
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import pose_gaussians
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.cameras.viewpoints import turntable, widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.render import SUPERSAMPLING, render_lit
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 SMOOTH_FPS = 20  # slower motions are also sampled between their frames, so that the orbit looks smooth
 MAX_PICTURES = 600  # limit for sampling between frames; longer videos still have all their own frames
 ELEVATION_DEG = 10.0  # of the camera
 TURN_S = 5  # duration of a turntable, seconds
+PROBES, OPAQUE = 32, 0.5  # frames, at most, and opacity of the Gaussians, that pictures have to hold
+PREVIEW_SAMPLES = 2  # of meshes, per pixel along each axis
 BATCH = 8  # images per rasterizer call; bounds memory
 CODECS = {  # best first; without `cpu-independent`, x264's lookahead changed the bytes of one video in ten
     "libx264": {"crf": "18", "preset": "medium", "x264-params": "cpu-independent=1"},
@@ -32,6 +36,26 @@ CODECS = {  # best first; without `cpu-independent`, x264's lookahead changed th
 }
 BT709 = 1  # color primaries, transfer and matrix, as numbered in H.273
 CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # colors of the background
+
+
+Background = Float[Tensor, "s s 3"]
+Pictures = Float[Tensor, "b h w 3"]
+
+
+class Orbit(NamedTuple):
+    """Layout of a video in which the camera goes round once.
+
+    Attributes:
+        pictures: their number.
+        fps: pictures per second.
+        size: of a panel, pixels.
+        panels: beside each other.
+    """
+
+    pictures: int
+    fps: float
+    size: int
+    panels: int
 
 
 def write_preview(
@@ -43,8 +67,12 @@ def write_preview(
     rasterizer: Rasterizer,
     settings: PackSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    mesh_at: Callable[[float], TexturedMesh] | None = None,
 ) -> tuple[str, ...]:
     """Write a silent MP4 (H.264, yuv420p) in which the motion loops `preview_turns` times during one orbit.
+
+    The left half shows the splats, the right half the mesh under a light. The camera's field of view is that of the
+    input, or as much larger as it takes to show the whole asset from all sides.
 
     Equal arguments give equal bytes.
 
@@ -57,6 +85,7 @@ def write_preview(
         rasterizer: the splatting backend.
         settings: size and number of loops.
         progress: called with finished images and their total number.
+        mesh_at: mesh at a position of the motion, in frames; None: the splats alone.
 
     Returns:
         Notes for the report: empty, or the name of the fallback codec.
@@ -68,10 +97,18 @@ def write_preview(
     repeats = max(1, min(ceil(SMOOTH_FPS / fps), MAX_PICTURES // (frames * settings.preview_turns)))
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
 
-    def states(part: slice) -> Gaussians:
-        return pose_gaussians(gaussians, deformation, frames, positions[part])
+    def draw(part: slice, cameras: Sequence[OrbitCamera], background: Background) -> Pictures:
+        states = pose_gaussians(gaussians, deformation, frames, positions[part])
+        splats = render_over(background, states, cameras, rasterizer)
+        if mesh_at is None:
+            return splats
+        meshes = [mesh_at(position) for position in positions[part].tolist()]
+        return torch.cat([splats, render_lit_over(background, meshes, cameras, PREVIEW_SAMPLES)], 2)
 
-    return _write_orbit(path, states, len(positions), fps * repeats, rasterizer, settings, progress)
+    panels = 1 if mesh_at is None else 2
+    orbit = Orbit(len(positions), fps * repeats, settings.preview_size, panels)
+    points = shown_points(gaussians, deformation, frames)
+    return _write_orbit(path, orbit, points, draw, progress)
 
 
 def write_turntable(
@@ -99,38 +136,51 @@ def write_turntable(
         BackendUnavailable: this build of FFmpeg has no supported MP4 codec.
         OSError: the file could not be written.
     """
-    return _write_orbit(path, lambda part: gaussians, TURN_S * SMOOTH_FPS, SMOOTH_FPS, rasterizer, settings, progress)
+
+    def draw(part: slice, cameras: Sequence[OrbitCamera], background: Background) -> Pictures:
+        return render_over(background, gaussians, cameras, rasterizer)
+
+    orbit = Orbit(TURN_S * SMOOTH_FPS, SMOOTH_FPS, settings.preview_size, 1)
+    return _write_orbit(path, orbit, _opaque(gaussians)[None], draw, progress)
 
 
 def _write_orbit(
     path: Path,
-    states: Callable[[slice], Gaussians],
-    count: int,
-    fps: float,
-    rasterizer: Rasterizer,
-    settings: PackSettings,
+    orbit: Orbit,
+    points: Float[Tensor, "t p 3"],
+    draw: Callable[[slice, Sequence[OrbitCamera], Background], Pictures],
     progress: Callable[[int, int], None],
 ) -> tuple[str, ...]:
-    """Write a video of one orbit; `states` returns the states of a range of its images."""
-    cameras = turntable(count, OrbitCamera(ELEVATION_DEG, width=settings.preview_size, height=settings.preview_size))
-    background = studio_background(settings.preview_size)
-    codec = _codec()
-    with Mp4Writer(path, codec, fps, settings.preview_size) as video:
+    """Write a video of one orbit that shows the points; `draw` returns a range of its images over a background."""
+    size, count = orbit.size, orbit.pictures
+    cameras = widened(turntable(count, OrbitCamera(ELEVATION_DEG, width=size, height=size)), points)
+    background, codec = studio_background(size), _codec()
+    with Mp4Writer(path, codec, orbit.fps, size, orbit.panels * size) as video:
         for start in range(0, count, BATCH):
             part = slice(start, start + BATCH)
-            video.add(render_over(background, states(part), cameras[part], rasterizer))
+            video.add(draw(part, cameras[part], background))
             progress(min(start + BATCH, count), count)
     return () if codec == "libx264" else (f"{path.name} is encoded with {codec}, since this FFmpeg lacks libx264",)
 
 
-def write_mp4(path: Path, pictures: Float[Tensor, "t s s 3"], fps: float) -> None:
-    """Write images in [0, 1] with an even number of pixels a side as a silent MP4.
+def shown_points(gaussians: Gaussians, deformation: Deformation, frames: int) -> Float[Tensor, "t p 3"]:
+    """Return centers of opaque Gaussians at some frames, which pictures of a motion have to hold."""
+    positions = torch.linspace(0, frames - 1, min(PROBES, frames)).round()
+    return _opaque(pose_gaussians(gaussians, deformation, frames, positions))
+
+
+def _opaque(states: Gaussians) -> Float[Tensor, "*t p 3"]:
+    return states.means[..., states.opacities > OPAQUE, :]
+
+
+def write_mp4(path: Path, pictures: Float[Tensor, "t h w 3"], fps: float) -> None:
+    """Write images in [0, 1] with even numbers of rows and columns as a silent MP4.
 
     Raises:
         BackendUnavailable: this build of FFmpeg has no supported MP4 codec.
         OSError: the file could not be written.
     """
-    with Mp4Writer(path, _codec(), fps, pictures.shape[1]) as video:
+    with Mp4Writer(path, _codec(), fps, *pictures.shape[1:3]) as video:
         video.add(pictures)
 
 
@@ -152,6 +202,17 @@ def render_over(
         return torch.addcmul(render.color, 1 - render.alpha, background.to(render.color)).clamp_(0, 1)
 
 
+def render_lit_over(
+    background: Float[Tensor, "h w 3"],
+    meshes: Sequence[TexturedMesh],
+    cameras: Sequence[OrbitCamera],
+    supersampling: int = SUPERSAMPLING,
+) -> Float[Tensor, "b h w 3"]:
+    """Render every mesh under a light from its camera over a background image."""
+    pictures = (render_lit(mesh, camera, supersampling) for mesh, camera in zip(meshes, cameras, strict=True))
+    return torch.stack([color * alpha + background * (1 - alpha) for color, alpha in pictures])
+
+
 def studio_background(size: int) -> Float[Tensor, "h w 3"]:
     """Return a light background image with a radial gradient."""
     line = torch.linspace(-1, 1, size)
@@ -162,12 +223,12 @@ def studio_background(size: int) -> Float[Tensor, "h w 3"]:
 class Mp4Writer:
     """Context manager that encodes an MP4; its bytes do not depend on time, host or number of cores."""
 
-    def __init__(self, path: Path, codec: str, fps: float, size: int) -> None:
+    def __init__(self, path: Path, codec: str, fps: float, height: int, width: int) -> None:
         self._container = av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"})
         rate = Fraction(fps).limit_denominator(1001)
         self._stream = cast(av.VideoStream, self._container.add_stream(codec, rate, dict(CODECS[codec])))
         context = self._stream.codec_context
-        self._stream.width = self._stream.height = size
+        self._stream.height, self._stream.width = height, width
         self._stream.pix_fmt = "yuv420p"
         context.thread_count = 1
         context.flags |= av.codec.context.Flags.bitexact

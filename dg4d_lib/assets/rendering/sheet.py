@@ -11,12 +11,12 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import pose_gaussians
-from dg4d_lib.assets.rendering.preview import BATCH, render_over
+from dg4d_lib.assets.rendering.preview import BATCH, render_lit_over, render_over, shown_points
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.viewpoints import widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import resize
-from dg4d_lib.mesh.render import render_lit
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -39,7 +39,7 @@ def draw_contact_sheet(
 
     Columns are frames, evenly spaced from the first to the last. The first row shows the driving video, the next ones
     the splats at one azimuth of `sheet_azimuths_deg` each, the last ones the lit mesh at one of
-    `sheet_mesh_azimuths_deg` each, all at elevation 0.
+    `sheet_mesh_azimuths_deg` each, all at elevation 0 and in one scale, at which nothing leaves a tile.
 
     Args:
         gaussians: the canonical cloud.
@@ -49,13 +49,16 @@ def draw_contact_sheet(
         settings: size of a tile, columns and rows.
         mesh_at: mesh at a frame; None: no rows of meshes.
     """
-    columns = min(settings.sheet_frames, len(video))
+    columns, size = min(settings.sheet_frames, len(video)), settings.sheet_size
     frames = torch.linspace(0, len(video) - 1, columns).round().long()
-    panel = torch.tensor(PANEL).expand(settings.sheet_size, settings.sheet_size, 3)
-    rows = [_video_tiles(video, frames, settings.sheet_size)]
+    panel = torch.tensor(PANEL).expand(size, size, 3)
     states = pose_gaussians(gaussians, deformation, len(video), frames.float())
-    for azimuth_deg in settings.sheet_azimuths_deg:
-        camera = OrbitCamera(azimuth_deg=azimuth_deg, width=settings.sheet_size, height=settings.sheet_size)
+    azimuths_deg = (0.0, *settings.sheet_azimuths_deg, *settings.sheet_mesh_azimuths_deg)
+    views = [OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size) for azimuth_deg in azimuths_deg]
+    front, *cameras = widened(views, shown_points(gaussians, deformation, len(video)))
+    rows = [_video_tiles(video, frames, size, views[0].tan_half_fov[0] / front.tan_half_fov[0])]
+    of_splats, of_meshes = cameras[: len(settings.sheet_azimuths_deg)], cameras[len(settings.sheet_azimuths_deg) :]
+    for camera in of_splats:
         tiles = [
             render_over(panel, _select_states(states, part), [camera] * len(part), rasterizer)
             for part in torch.arange(columns).split(BATCH)
@@ -64,17 +67,9 @@ def draw_contact_sheet(
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
     if mesh_at is not None:
         meshes = [mesh_at(int(frame)) for frame in frames]
-        rows += [_lit_tiles(meshes, azimuth_deg, panel) for azimuth_deg in settings.sheet_mesh_azimuths_deg]
+        rows += [render_lit_over(panel, meshes, [camera] * columns) for camera in of_meshes]
         names += [f"mesh {azimuth_deg:g}°" for azimuth_deg in settings.sheet_mesh_azimuths_deg]
     return draw_tiles(torch.stack(rows), names, _timestamps(frames, video.fps))
-
-
-def _lit_tiles(
-    meshes: Sequence[TexturedMesh], azimuth_deg: float, panel: Float[Tensor, "s s 3"]
-) -> Float[Tensor, "m s s 3"]:
-    camera = OrbitCamera(azimuth_deg=azimuth_deg, width=len(panel), height=len(panel))
-    lit = (render_lit(mesh, camera) for mesh in meshes)
-    return torch.stack([color * alpha + panel * (1 - alpha) for color, alpha in lit])
 
 
 def draw_video_sheet(
@@ -123,7 +118,10 @@ def _select_states(states: Gaussians, index: Tensor) -> Gaussians:
     return replace(states, means=states.means[index], log_scales=states.log_scales[index], quats=states.quats[index])
 
 
-def _video_tiles(video: DrivingVideo, frames: Tensor, size: int) -> Float[Tensor, "m size size 3"]:
-    """Composite frames of the video over the panel color and resize them to tiles."""
+def _video_tiles(video: DrivingVideo, frames: Tensor, size: int, scale: float = 1.0) -> Float[Tensor, "m size size 3"]:
+    """Composite frames of the video over the panel color and resize them to a part of the side of tiles."""
     over = DrivingVideo(video.frames[frames], video.alpha[frames], video.fps).over(torch.tensor(PANEL))
-    return resize(over, (size, size)).clamp(0, 1)
+    tiles, side = torch.tensor(PANEL).expand(len(frames), size, size, 3).clone(), max(1, round(scale * size))
+    first = (size - side) // 2
+    tiles[:, first : first + side, first : first + side] = resize(over, (side, side)).clamp(0, 1)
+    return tiles

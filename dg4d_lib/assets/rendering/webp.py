@@ -11,8 +11,9 @@ from PIL import Image
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import pose_gaussians
-from dg4d_lib.assets.rendering.preview import BATCH, render_over, studio_background
+from dg4d_lib.assets.rendering.preview import BATCH, render_over, shown_points, studio_background
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.viewpoints import widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.rasterizer.interface import Rasterizer
@@ -59,7 +60,8 @@ def write_webp(
     positions = phases * loops * frames % frames
     size = min(LARGEST, settings.preview_size)
     front, background = OrbitCamera(width=size, height=size), studio_background(size)
-    cameras = [replace(front, azimuth_deg=SWAY_DEG * math.sin(math.tau * phase)) for phase in phases.tolist()]
+    swaying = [replace(front, azimuth_deg=SWAY_DEG * math.sin(math.tau * phase)) for phase in phases.tolist()]
+    cameras = widened(swaying, shown_points(gaussians, deformation, frames))
     pictures: list[Image.Image] = []
     for start in range(0, count, BATCH):
         part = slice(start, start + BATCH)

@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.rendering import preview
@@ -18,6 +19,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.reference import rasterize
 
 SETTINGS = PackSettings(preview_size=64, preview_turns=2)
@@ -92,6 +94,38 @@ def test_the_object_is_drawn_where_it_is(written: Path) -> None:
     assert columns[0] == pytest.approx(31.5, abs=0.5)
     assert columns[6] == pytest.approx(expected, abs=1)
     assert abs(expected - 31.5) > 3
+
+
+def test_the_mesh_is_beside_the_splats(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
+    """A green ball that moves as the red one does."""
+    asked: list[float] = []
+
+    def mesh_at(position: float) -> TexturedMesh:
+        asked.append(position)
+        ball = trimesh.creation.icosphere(2, 0.2)
+        vertices = torch.from_numpy(ball.vertices).float() + torch.tensor([0.25 * min(position, 2), 0, 0])
+        faces, uvs = torch.from_numpy(ball.faces).int(), torch.full((len(vertices), 2), 0.5)
+        return TexturedMesh(vertices, faces, uvs, torch.tensor((0.0, 1.0, 0.0)).expand(4, 4, 3).clone())
+
+    path = tmp_path / "both.mp4"
+    write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS, mesh_at=mesh_at)
+    pictures, _ = film(path)
+    assert pictures.shape == (FRAMES * 3 * 2, 64, 128, 3)
+    assert asked[:4] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    places = []
+    for half, channel in ((pictures[:, :, :64], 0), (pictures[:, :, 64:], 1)):
+        color = (half[..., channel] - half[..., 2] - 0.2).clip(0)
+        places.append((color.sum(1) * np.arange(64)).sum(-1) / color.sum((1, 2)))
+    np.testing.assert_allclose(places[0][:7], places[1][:7], atol=1)
+
+
+def test_what_comes_near_the_camera_stays_in_the_picture(tmp_path: Path, red_dot: Gaussians) -> None:
+    high = replace(red_dot, means=torch.tensor([[0.0, 0.8, -1.0]]))  # 35 degrees up from behind, where 25 are shown
+    write_turntable(tmp_path / "turntable.mp4", high, rasterize, SETTINGS)
+    pictures, _ = film(tmp_path / "turntable.mp4")
+    redness = (pictures[..., 0] - pictures[..., 1]).clip(0)
+    rows = (redness[50].sum(1) * np.arange(64)).sum() / redness[50].sum()
+    assert redness[50].max() > 0.5 and 1 < rows < 8
 
 
 def test_equal_assets_give_equal_films(written: Path, tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:

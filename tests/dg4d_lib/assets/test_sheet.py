@@ -1,5 +1,7 @@
 """Contact sheets: layout, driving video in the first row, readable captions."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import trimesh
@@ -108,3 +110,14 @@ def test_several_videos_are_rows_in_the_given_order() -> None:
     for column in range(3):
         torch.testing.assert_close(tile(page, 0, column, rows=2)[24, 24], torch.tensor([0.0, 1.0, 0.0]))
         torch.testing.assert_close(tile(page, 1, column, rows=2)[24, 24], torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_what_comes_near_from_behind_is_whole_and_all_tiles_have_one_scale(
+    red_dot: Gaussians, slide: Framewise
+) -> None:
+    high = replace(red_dot, means=torch.tensor([[0.0, 0.5, -1.0]]))  # 27 degrees up from behind, where 25 are shown
+    sheet = draw_contact_sheet(high, slide, footage(5), rasterize, SETTINGS)
+    redness = (tile(sheet, 2, 0)[..., 0] - tile(sheet, 2, 0)[..., 1]).clip(0)
+    assert redness.max() > 0.5
+    greenness = (tile(sheet, 0, 0)[..., 1] - tile(sheet, 0, 0)[..., 0]) > 0.5
+    assert int(greenness.any(0).sum()) < SIZE // 2  # the footage's square, half of the width of its frame

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.cameras.viewpoints import baking_views, random_orbit, spread_orbit, turntable
+from dg4d_lib.cameras.viewpoints import MARGIN, baking_views, random_orbit, spread_orbit, turntable, widened
 
 
 def test_random_views_stay_in_their_ranges_and_go_all_around():
@@ -49,3 +49,24 @@ def test_random_cameras_come_in_rings_where_they_are_asked_to():
         turns = [camera.azimuth_deg - four[0].azimuth_deg for camera in four]
         assert turns == pytest.approx([0, 90, 180, 270])
     assert cameras[0] != cameras[4]
+
+
+def test_what_fits_is_seen_as_before():
+    cameras = turntable(4, OrbitCamera(10))
+    assert widened(cameras, 0.5 * torch.eye(3)[None]) == cameras
+    assert widened(cameras, torch.zeros(2, 0, 3)) == cameras
+
+
+def test_what_comes_near_fits_in_the_end():
+    """A point to the right of the view from the front is nearer, and outside, in the view from its side."""
+    cameras = turntable(2, OrbitCamera())
+    points = torch.tensor([[[0.0, 0.0, 0.0]], [[0.9, 0.0, -0.6]]])
+    wider = widened(cameras, points)
+    assert {camera.fov_y_deg for camera in wider} == {wider[0].fov_y_deg}
+    assert wider[0].tan_half_fov[1] == pytest.approx((1 + MARGIN) * 0.9 / (2 - 0.6))
+    assert [camera.azimuth_deg for camera in wider] == [0, 180]
+
+
+def test_strays_are_not_waited_for():
+    points = torch.cat([torch.zeros(4000, 3), torch.tensor([[5.0, 0.0, 0.0]])])[None]
+    assert widened([OrbitCamera()], points) == [OrbitCamera()]

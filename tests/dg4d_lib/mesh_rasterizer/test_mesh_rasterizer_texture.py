@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
-from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_bilinear, sample_texture
+from dg4d_lib.mesh_rasterizer import texture_cpu
+from dg4d_lib.mesh_rasterizer.texture import (
+    TextureLookup,
+    build_lookup,
+    sample_bilinear,
+    sample_texture,
+    texture_places,
+)
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 CAMERA = OrbitCamera(width=32, height=32)
@@ -136,6 +143,18 @@ def test_states_and_cameras_belong_together():
     ]
     alone = torch.cat([sample_texture(texture, part) for part in parts])
     torch.testing.assert_close(sample_texture(texture, both), alone, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_kernels_and_operators_find_the_same_places(shared: bool):
+    cameras = [OrbitCamera(-20, -30, width=64, height=48), OrbitCamera(30, 40, width=64, height=48)]
+    states = slanted() if shared else torch.stack([board(20), slanted()])
+    fragments = rasterize_mesh(states, FACES, cameras)
+    uvs, levels = texture_cpu.texture_places(states, FACES, UVS, (128, 300), cameras, fragments)
+    expected = texture_places(states, FACES, UVS, (128, 300), cameras, fragments)
+    assert len(uvs) == (fragments.faces >= 0).sum() > 500
+    torch.testing.assert_close(uvs, expected[0], atol=1e-7, rtol=0)
+    torch.testing.assert_close(levels, expected[1], atol=1e-6, rtol=0)
 
 
 def test_nothing_seen_is_nothing_read():
