@@ -22,6 +22,7 @@ FILTERS = (
     "meshing_merge_close_vertices",
     "meshing_remove_duplicate_faces",
     "meshing_remove_null_faces",
+    "get_topological_measures",
     "apply_coord_taubin_smoothing",
     "meshing_isotropic_explicit_remeshing",
     "generate_resampled_uniform_mesh",
@@ -45,11 +46,14 @@ def clean_arrays(arrays: Arrays) -> Arrays:
     if missing:
         raise _unavailable(f"pymeshlab lacks the filter {missing[0]} and {len(missing) - 1} other required ones")
     length, max_faces = float(arrays["edge_length"]), int(arrays["max_faces"])
-    ms = pymeshlab.MeshSet(verbose=False)
-    ms.add_mesh(pymeshlab.Mesh(arrays["vertices"], arrays["faces"]))
+    ms, given = pymeshlab.MeshSet(verbose=False), pymeshlab.Mesh(arrays["vertices"], arrays["faces"])
+    ms.add_mesh(given)
     ms.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(MERGE))
     ms.meshing_remove_duplicate_faces()
     ms.meshing_remove_null_faces()
+    if ms.get_topological_measures()["non_two_manifold_edges"]:  # it joined two sheets, and repairs twist them
+        ms.clear()
+        ms.add_mesh(given)
     ms.apply_coord_taubin_smoothing(stepsmoothnum=SMOOTHING, selected=False)
     ms.meshing_isotropic_explicit_remeshing(
         iterations=REMESHING, targetlen=pymeshlab.PureValue(length), selectedonly=False, checksurfdist=False

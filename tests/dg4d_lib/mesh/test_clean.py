@@ -47,6 +47,14 @@ def test_there_are_no_more_faces_than_allowed(sphere: Mesh) -> None:
     assert 350 < len(faces) <= 500
 
 
+def test_sheets_that_almost_touch_stay_apart() -> None:
+    """Merging the ends of their edges would leave an edge of four triangles."""
+    box = trimesh.creation.box(bounds=[[-0.5, -0.5, -0.5], [0, 0, 0.5]])
+    other = trimesh.creation.box(bounds=[[5e-5, 5e-5, -0.5], [0.5, 0.5, 0.5]])
+    cleaned = clean(*both(*((one.vertices, one.faces.astype(np.int32)) for one in (box, other))), COARSE)
+    assert check_topology(*cleaned).valid and check_topology(*cleaned).components == 2
+
+
 def test_handles_do_not_stand_in_the_way_of_the_limit() -> None:
     """A sponge of more than a hundred handles, each of which needs some triangles, and too few of them."""
     axis = np.linspace(-1, 1, 40)
@@ -111,7 +119,7 @@ def fake_pymeshlab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_missing_filters_name_the_system_libraries(sphere: Mesh, fake_pymeshlab: Path) -> None:
     fake_pymeshlab.write_text("def filter_list(): return ['meshing_close_holes']")
-    with pytest.raises(BackendUnavailable, match=r"lacks the filter .* and 10 other required ones.*libgl1 libopengl0"):
+    with pytest.raises(BackendUnavailable, match=r"lacks the filter .* and 11 other required ones.*libgl1 libopengl0"):
         clean(*sphere, COARSE)
 
 
