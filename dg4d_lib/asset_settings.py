@@ -152,12 +152,6 @@ class PackSettings(Settings):
     preview_size: int = Field(
         384, ge=64, le=2048, description="pixels of turntable.mp4 and of each half of preview.mp4", multiple_of=2
     )
-        384,
-        ge=64,
-        le=2048,
-        description="pixels of a side of turntable.mp4, and of each half of preview.mp4",
-        multiple_of=2,
-    )
     preview_turns: int = Field(3, ge=1, le=20, description="loops of the motion per orbit of the camera")
     sheet_size: int = Field(192, ge=32, le=1024, description="pixels of a tile of the contact sheet")
     sheet_frames: int = Field(6, ge=1, le=32, description="columns: frames")
