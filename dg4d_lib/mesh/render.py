@@ -13,7 +13,8 @@ from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
-from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
+from dg4d_lib.mesh_rasterizer.texture_cpu import texture_colors
+from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 SUPERSAMPLING = 3  # samples per pixel along each axis, unless told; odd, so that no pixel is covered by exactly half
 LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera's axes (x right, y down, z forward)
@@ -42,8 +43,7 @@ def render_mesh(
             cameras.
     """
     vertices = mesh.vertices if offsets is None else mesh.vertices + offsets
-    fragments, samples = _samples(mesh, vertices, cameras, supersampling)
-    return _pooled(samples, fragments, supersampling)
+    return _render(mesh, vertices, cameras, None, supersampling)
 
 
 def render_lit(
@@ -59,31 +59,31 @@ def render_lit(
     Returns:
         Straight color and alpha, in [0, 1].
     """
-    fragments, samples = _samples(mesh, mesh.vertices, [camera], supersampling)
     towards = normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0) @ camera.viewmat()[:3, :3]
-    cosines = (smooth_normals(mesh) @ towards.to(mesh.vertices)).clamp_min(0)
-    lit = samples * interpolate(fragments, mesh.faces, AMBIENT + DIFFUSE * cosines[:, None])
-    color, alpha = _pooled(lit.clamp(0, 1), fragments, supersampling)
+    light = AMBIENT + DIFFUSE * (smooth_normals(mesh) @ towards.to(mesh.vertices)).clamp_min(0)
+    color, alpha = _render(mesh, mesh.vertices, [camera], light, supersampling)
     return color[0], alpha[0]
 
 
-def _samples(
-    mesh: TexturedMesh, vertices: Float[Tensor, "*b v 3"], cameras: Sequence[OrbitCamera], side: int
-) -> tuple[Fragments, Float[Tensor, "b i j 3"]]:
-    """Return what the samples of finer pixels show, and their colors; 0 where there is nothing."""
+def _render(
+    mesh: TexturedMesh,
+    vertices: Float[Tensor, "*b v 3"],
+    cameras: Sequence[OrbitCamera],
+    light: Float[Tensor, " v"] | None,
+    side: int,
+) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
+    """Return straight color and alpha of pixels of several samples a side, under a light if vertices have one."""
     fine = [replace(camera, width=side * camera.width, height=side * camera.height) for camera in cameras]
     fragments = rasterize_mesh(vertices, mesh.faces, fine)
+    graded = torch.is_grad_enabled() and mesh.texture.requires_grad
+    if vertices.device.type == "cpu" and mesh.texture.dtype == torch.float32 and not graded:
+        return texture_colors(vertices, mesh.faces, mesh.uvs, mesh.texture, light, fine, fragments, side)
     lookup = build_lookup(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
     samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
     samples[lookup.covered] = sample_texture(mesh.texture, lookup)
-    return fragments, samples
-
-
-def _pooled(
-    samples: Float[Tensor, "b i j 3"], fragments: Fragments, side: int
-) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-    """Return straight color and alpha of pixels from those of their samples."""
-    covered = (fragments.faces >= 0)[..., None].to(samples)
+    if light is not None:
+        samples = (samples * interpolate(fragments, mesh.faces, light[:, None])).clamp(0, 1)
+    covered = lookup.covered[..., None].to(samples)
     color, alpha = (avg_pool2d(each.movedim(-1, 1), side).movedim(1, -1) for each in (samples, covered))
     return color / alpha.clamp_min(0.5 / side**2), alpha
 

@@ -1,10 +1,12 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+import trimesh
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.render import render_mesh
+from dg4d_lib.mesh.render import render_lit, render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 
 SIZE = 32
@@ -65,3 +67,32 @@ def test_fine_textures_come_out_as_their_mean(board: TexturedMesh) -> None:
     color, _ = render_mesh(TexturedMesh(board.vertices, board.faces, board.uvs, noise), [CAMERA])
     mean = noise.reshape(16, 16, 16, 16, 3).mean((1, 3))
     assert (color[0, 8:24, 8:24] - mean).square().mean().sqrt() < 0.02
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 32), (100, 64), (37, 50)])
+def test_kernels_draw_what_operators_with_gradients_draw(height: int, width: int) -> None:
+    """A ball with noise as texture, from near, where it is magnified, and as small as a few pixels."""
+    ball = trimesh.creation.icosphere(3, 0.5)
+    vertices = torch.from_numpy(ball.vertices).float()
+    uvs = torch.stack([vertices[:, 0] + 0.5, 0.5 - vertices[:, 1]], 1)
+    texture = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+    mesh = TexturedMesh(vertices, torch.from_numpy(ball.faces).int(), uvs, texture)
+    graded = replace(mesh, texture=texture.clone().requires_grad_())
+    cameras = [replace(CAMERA, azimuth_deg=30, fov_y_deg=fov_y_deg) for fov_y_deg in (20, 150)]
+    for supersampling in (1, 3):
+        drawn = render_mesh(mesh, cameras, supersampling=supersampling)
+        expected = render_mesh(graded, cameras, supersampling=supersampling)
+        lit, lit_expected = (render_lit(one, cameras[0], supersampling) for one in (mesh, graded))
+        for one, other in zip((*drawn, *lit), (*expected, *lit_expected), strict=True):
+            assert one.max() > 0.1
+            torch.testing.assert_close(one, other.detach(), atol=2e-5, rtol=0)
+
+
+def test_light_leaves_no_dark_border() -> None:
+    """A white ball under the light, over gray: no pixel of its lit side is darker than the gray."""
+    ball = trimesh.creation.icosphere(4, 0.5)
+    vertices = torch.from_numpy(ball.vertices).float()
+    faces, uvs = torch.from_numpy(ball.faces).int(), torch.full((len(vertices), 2), 0.5)
+    color, alpha = render_lit(TexturedMesh(vertices, faces, uvs, torch.ones(4, 4, 3)), replace(CAMERA, elevation_deg=5))
+    upper_left = (color * alpha + 0.6 * (1 - alpha))[: SIZE // 2, : SIZE // 2]
+    assert alpha[: SIZE // 2, : SIZE // 2].max() == 1 and upper_left.min() > 0.59
