@@ -13,15 +13,15 @@ from steps.store.files import write_atomically
 
 USUAL_S: Mapping[str, float] = {  # seconds of the profile `preview` on two cores; only their ratios count
     "draw_picture": 60.0,
-    "prepare_subject": 3.0,
-    "drive_video": 4.0,
-    "fit_gaussians": 12.0,
-    "fit_motion": 45.0,
-    "plan_mesh": 2.0,
-    "extract_mesh": 12.0,
+    "prepare_subject": 1.0,
+    "drive_video": 1.0,
+    "fit_gaussians": 10.0,
+    "fit_motion": 47.0,
+    "plan_mesh": 6.0,
+    "extract_mesh": 38.0,
     "refine_texture": 60.0,
-    "pack_asset": 8.0,
-    "check_asset": 4.0,
+    "pack_asset": 12.0,
+    "check_asset": 3.0,
 }
 KNOWN_SHARE = 0.05  # of the expected work, from which on the pace of this run counts
 OWN_PACE = 0.1  # fraction of a step, from which on its own pace predicts its end

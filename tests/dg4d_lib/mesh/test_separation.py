@@ -169,6 +169,22 @@ def test_a_knob_inside_the_body_shrinks_to_a_cap_over_the_hole(
     assert np.abs(capped - sunk)[below].max() < 0.03
 
 
+def test_a_rod_inside_the_body_does_not_shrink_to_a_point() -> None:
+    """It would have triangles smaller than a step of quantized positions."""
+    rest, faces = solid(
+        ((-0.35, -0.3, 0), (0.35, -0.3, 0), 0.25),
+        ((-0.35, -0.3, 0), (-0.35, 0.3, 0), 0.06),
+        ((-0.35, 0.3, 0), (0.2, 0.3, 0), 0.06),
+        ((0.2, 0.3, 0), (0.2, 0.0, 0), 0.04),
+    )
+    rod = (np.abs(rest[:, 0] - 0.2) < 0.1) & (rest[:, 1] > -0.045)
+    lowered = np.where(rod | (rest[:, 1] > 0.1), ((rest[:, 0] + 0.25) / 0.35).clip(0, 1), 0)
+    sunk = rest - 0.3 * (lowered**2 * (3 - 2 * lowered))[:, None] * np.array([0.0, 1, 0])
+    capped = cap(InnerBalls(rest, faces), sunk)
+    assert crossings(rest[None], faces) == [0] == crossings(capped[None], faces) < crossings(sunk[None], faces)
+    assert np.ptp(capped[rod & (rest[:, 1] < 0.1)], axis=0).min() > 2e-3
+
+
 def test_outlines_decide_whether_a_cap_is_kept(body_under_knob: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     rest, faces, sunk = body_under_knob
     balls = InnerBalls(rest, faces)
