@@ -214,7 +214,9 @@ def _shade(vertices, faces, uvs, texels, focal, ids, weights, mips, sizes, light
 def _read(mips, sizes, level, u, v, weight, sample):
     """Add the color of one mip level, read bilinearly and clamped at the border."""
     first, height, width = sizes[level, 0], sizes[level, 1], sizes[level, 2]
-    x, y = min(max(u * width - 0.5, 0.0), width - 1.0), min(max(v * height - 0.5, 0.0), height - 1.0)
+    x, y = u * width - 0.5, v * height - 0.5
+    x = min(x, width - 1.0) if x > 0 else 0.0  # also where it is not a number
+    y = min(y, height - 1.0) if y > 0 else 0.0
     left, top = int(x), int(y)
     right, below = min(left + 1, width - 1), min(top + 1, height - 1)
     a, b = np.float32(x - left), np.float32(y - top)

@@ -88,6 +88,13 @@ def test_kernels_draw_what_operators_with_gradients_draw(height: int, width: int
             torch.testing.assert_close(one, other.detach(), atol=2e-5, rtol=0)
 
 
+def test_coordinates_that_are_no_numbers_read_the_first_texel(board: TexturedMesh) -> None:
+    """And those far outside of the texture its border."""
+    for value in (math.nan, -math.inf, -1e30):
+        color, alpha = render_mesh(replace(board, uvs=torch.full_like(board.uvs, value)), [CAMERA])
+        torch.testing.assert_close(color[alpha[..., 0] == 1].unique(dim=0), torch.tensor([[1.0, 0, 0]]))
+
+
 def test_light_leaves_no_dark_border() -> None:
     """A white ball under the light, over gray: no pixel of its lit side is darker than the gray."""
     ball = trimesh.creation.icosphere(4, 0.5)
