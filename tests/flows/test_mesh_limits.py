@@ -27,9 +27,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.parametrize("name", FLIPPED)
-def test_no_mesh_crosses_itself_or_folds_and_hardly_a_face_turns_over(
-    home: dict[str, str], tmp_path: Path, name: str
-) -> None:
+def test_meshes_stay_within_the_limits(home: dict[str, str], tmp_path: Path, name: str) -> None:
     words = [str(DEMO)]
     if name != "demo":
         footage = tmp_path / "footage"
