@@ -13,7 +13,7 @@ from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
-from dg4d_lib.mesh_rasterizer.texture_cpu import texture_colors
+from dg4d_lib.mesh_rasterizer.texture_cpu import Rasterized, texture_colors
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 SUPERSAMPLING = 3  # samples per pixel along each axis, unless told; odd, so that no pixel is covered by exactly half
@@ -75,9 +75,9 @@ def _render(
     """Return straight color and alpha of pixels of several samples a side, under a light if vertices have one."""
     fine = [replace(camera, width=side * camera.width, height=side * camera.height) for camera in cameras]
     fragments = rasterize_mesh(vertices, mesh.faces, fine)
-    graded = torch.is_grad_enabled() and mesh.texture.requires_grad
-    if vertices.device.type == "cpu" and mesh.texture.dtype == torch.float32 and not graded:
-        return texture_colors(vertices, mesh.faces, mesh.uvs, mesh.texture, light, fine, fragments, side)
+    with_gradients = torch.is_grad_enabled() and mesh.texture.requires_grad
+    if vertices.device.type == "cpu" and mesh.texture.dtype == torch.float32 and not with_gradients:
+        return texture_colors(Rasterized(vertices, mesh.faces, mesh.uvs, fine, fragments), mesh.texture, light, side)
     lookup = build_lookup(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
     samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
     samples[lookup.covered] = sample_texture(mesh.texture, lookup)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh_rasterizer import texture_cpu
@@ -70,7 +70,7 @@ def build_lookup(
     """
     covered = fragments.faces >= 0
     places = texture_cpu.texture_places if vertices.device.type == "cpu" else texture_places
-    uv, level = places(vertices, faces, uvs, size, cameras, fragments)
+    uv, level = places(texture_cpu.Rasterized(vertices, faces, uvs, cameras, fragments), size)
     coarsest = (max(size) - 1).bit_length()  # level of a single texel
     level = level.nan_to_num(0).clamp(0, coarsest)  # NaN in edge-on triangles
     return TextureLookup(covered, tuple(_taps(uv, level)))
@@ -91,14 +91,10 @@ def sample_bilinear(image: Float[Tensor, "h w c"], uvs: Float[Tensor, "n 2"]) ->
 
 
 def texture_places(
-    vertices: Float[Tensor, "*b v 3"],
-    faces: Int[Tensor, "f 3"],
-    uvs: Float[Tensor, "v 2"],
-    size: Sequence[int],
-    cameras: Sequence[OrbitCamera],
-    fragments: Fragments,
+    rasterized: texture_cpu.Rasterized, size: Sequence[int]
 ) -> tuple[Float32[Tensor, "p 2"], Float32[Tensor, " p"]]:
-    """Return texture coordinates and mip levels of all covered pixels; arguments are those of `build_lookup`."""
+    """Return texture coordinates and mip levels of all covered pixels, for a texture of that height and width."""
+    vertices, faces, uvs, cameras, fragments = rasterized
     covered, indices, texels = fragments.faces >= 0, faces.long(), uvs.new_tensor((size[1], size[0]))
     pixel_uvs, levels = [], []
     for view, camera in enumerate(cameras):
@@ -152,6 +148,4 @@ def _mip_levels(texture: Float[Tensor, "h w c"]) -> Iterator[Float[Tensor, "i j 
     mip = texture.movedim(-1, 0)
     while True:
         yield mip.movedim(0, -1)
-        height, width = mip.shape[1:]
-        even = height % 2 == width % 2 == 0
-        mip = avg_pool2d(mip, 2) if even else adaptive_avg_pool2d(mip, (-(-height // 2), -(-width // 2)))
+        mip = adaptive_avg_pool2d(mip, (-(-mip.shape[1] // 2), -(-mip.shape[2] // 2)))

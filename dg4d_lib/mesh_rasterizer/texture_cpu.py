@@ -5,7 +5,7 @@ Each view is one job of the thread pool, so the number of threads does not chang
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import torch
@@ -21,49 +21,49 @@ from dg4d_lib.mesh_rasterizer.zbuffer import Fragments
 _COMPILED = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 
-def texture_places(
-    vertices: Float[Tensor, "*b v 3"],
-    faces: Int[Tensor, "f 3"],
-    uvs: Float[Tensor, "v 2"],
-    size: Sequence[int],
-    cameras: Sequence[OrbitCamera],
-    fragments: Fragments,
-) -> tuple[Float32[Tensor, "p 2"], Float32[Tensor, " p"]]:
-    """Return texture coordinates and mip levels of all covered pixels; arguments are those of `build_lookup`."""
-    starts = np.concatenate([[0], (fragments.faces >= 0).sum((1, 2)).numpy().cumsum()])
+class Rasterized(NamedTuple):
+    """Mesh with texture coordinates, and the fragments of its images.
+
+    Attributes:
+        vertices: one mesh for all images ("v 3") or one state per image ("b v 3"), world units.
+        faces: indices into the vertices.
+        uvs: texture coordinates in [0, 1], u right and v down.
+        cameras: of the images.
+        fragments: output of the rasterizer.
+    """
+
+    vertices: Float[Tensor, "*b v 3"]
+    faces: Int[Tensor, "f 3"]
+    uvs: Float[Tensor, "v 2"]
+    cameras: Sequence[OrbitCamera]
+    fragments: Fragments
+
+
+def texture_places(rasterized: Rasterized, size: Sequence[int]) -> tuple[Float32[Tensor, "p 2"], Float32[Tensor, " p"]]:
+    """Return texture coordinates and mip levels of all covered pixels, for a texture of that height and width."""
+    starts = np.concatenate([[0], (rasterized.fragments.faces >= 0).sum((1, 2)).numpy().cumsum()])
     places, levels = np.empty((starts[-1], 2), np.float32), np.empty(starts[-1], np.float32)
 
     def place(view: int, *scene: object) -> None:
         part = slice(*starts[view : view + 2])
         _place(*scene, places[part], levels[part])
 
-    _of_views(place, vertices, faces, uvs, size, cameras, fragments)
+    _of_views(place, rasterized, size)
     return torch.from_numpy(places), torch.from_numpy(levels)
 
 
 def texture_colors(
-    vertices: Float[Tensor, "*b v 3"],
-    faces: Int[Tensor, "f 3"],
-    uvs: Float[Tensor, "v 2"],
-    texture: Float[Tensor, "y x 3"],
-    light: Float[Tensor, " v"] | None,
-    cameras: Sequence[OrbitCamera],
-    fragments: Fragments,
-    side: int,
+    rasterized: Rasterized, texture: Float[Tensor, "y x 3"], light: Float[Tensor, " v"] | None, side: int
 ) -> tuple[Float32[Tensor, "b h w 3"], Float32[Tensor, "b h w 1"]]:
     """Return straight color and alpha of pixels, each the mean of `side` x `side` samples.
 
     Args:
-        vertices: the vertices that were rasterized.
-        faces: the faces that were rasterized.
-        uvs: texture coordinates in [0, 1], u right and v down.
+        rasterized: the mesh in images whose pixels are the samples.
         texture: colors in [0, 1].
         light: factor of the colors at every vertex; lit colors end at 1. None: 1.
-        cameras: of the samples.
-        fragments: output of the rasterizer, by sample.
         side: samples per pixel along each axis.
     """
-    count, height, width = fragments.faces.shape
+    count, height, width = rasterized.fragments.faces.shape
     color = np.zeros((count, height // side, width // side, 3), np.float32)
     alpha = np.zeros((*color.shape[:3], 1), np.float32)
     factors = None if light is None else light.detach().float().numpy()
@@ -72,20 +72,13 @@ def texture_colors(
     def shade(view: int, *scene: object) -> None:
         _shade(*scene, *mips, factors, side, color[view], alpha[view])
 
-    _of_views(shade, vertices, faces, uvs, texture.shape[:2], cameras, fragments)
+    _of_views(shade, rasterized, texture.shape[:2])
     return torch.from_numpy(color), torch.from_numpy(alpha)
 
 
-def _of_views(
-    work: Callable[..., None],
-    vertices: Float[Tensor, "*b v 3"],
-    faces: Int[Tensor, "f 3"],
-    uvs: Float[Tensor, "v 2"],
-    size: Sequence[int],
-    cameras: Sequence[OrbitCamera],
-    fragments: Fragments,
-) -> None:
-    """Call a function for every view with its number and what the kernels know of it."""
+def _of_views(work: Callable[..., None], rasterized: Rasterized, size: Sequence[int]) -> None:
+    """Call a function for every image with its number and what the kernels know of it."""
+    vertices, faces, uvs, cameras, fragments = rasterized
     states, coordinates = vertices.detach().double().numpy(), uvs.detach().double().numpy()
     triangles = np.ascontiguousarray(faces.int().numpy())
     ids, weights = fragments.faces.numpy(), fragments.barycentrics.detach().numpy()

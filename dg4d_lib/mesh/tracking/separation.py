@@ -42,7 +42,7 @@ MANY, EVERY = 60, 3  # of more submerged vertices of a frame than that, every th
 TOLERANCE, ITERATIONS = 1e-3, 60  # of the linear solver
 GAIN = 0.5  # share of the crossings that must go for the push to be kept
 LOOSE = 1e-6  # pull of a cap's vertices to where they are, against 1 per edge: holds pieces that lie inside as a whole
-KEPT = 0.02  # share of their way to the membrane that they do not go: a limb would end as a point
+KEPT = 0.02  # share of the distance to the membrane that is kept, so that a long limb does not shrink to a point
 GRAIN = 3e-5  # world units, about a step of positions in files; crossings are counted after rounding to it
 CAPS = (1, 2, 4, 6, 8)  # rings of vertices around what is submerged that shrink with it, one attempt after the other
 

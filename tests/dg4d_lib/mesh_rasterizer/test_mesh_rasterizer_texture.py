@@ -150,8 +150,9 @@ def test_kernels_and_operators_find_the_same_places(shared: bool):
     cameras = [OrbitCamera(-20, -30, width=64, height=48), OrbitCamera(30, 40, width=64, height=48)]
     states = slanted() if shared else torch.stack([board(20), slanted()])
     fragments = rasterize_mesh(states, FACES, cameras)
-    uvs, levels = texture_cpu.texture_places(states, FACES, UVS, (128, 300), cameras, fragments)
-    expected = texture_places(states, FACES, UVS, (128, 300), cameras, fragments)
+    rasterized = texture_cpu.Rasterized(states, FACES, UVS, cameras, fragments)
+    uvs, levels = texture_cpu.texture_places(rasterized, (128, 300))
+    expected = texture_places(rasterized, (128, 300))
     assert len(uvs) == (fragments.faces >= 0).sum() > 500
     torch.testing.assert_close(uvs, expected[0], atol=1e-7, rtol=0)
     torch.testing.assert_close(levels, expected[1], atol=1e-6, rtol=0)
