@@ -6,6 +6,7 @@ of an error is. Vertices on the outline move across it, parallel to the picture,
 
 from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -20,6 +21,8 @@ from dg4d_lib.mesh.tracking.outline_registration import outline_of, outline_step
 
 SIZE = 1024  # pixels of the compared outlines
 ROUNDS = 5
+PASSES = 3  # at most, of so many rounds
+HELD = 0.1  # share of the motion of a pass, undone because of new defects, up to which there is no other pass
 LONGEST = 8.0  # pixels of a step; what is farther off is no detail
 PULL = 10.0  # weight of the step of a vertex on the outline, against 1 for the difference along each of its edges
 STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 4 edges
@@ -33,7 +36,8 @@ def fit_outline_detail(
 ) -> Float[Tensor, "t v 3"]:
     """Return offsets by which the outline of the mesh at the input view is that of the video in detail.
 
-    Frames get no defects that they do not have: there the vertices stay.
+    Frames get no defects that they do not have: there the vertices stay. Where much has to stay, the rest moves once
+    more from there.
 
     Args:
         vertices: in the reference frame, not split along seams.
@@ -48,13 +52,18 @@ def fit_outline_detail(
     def fit_frame(frame: int) -> None:
         target = outline_of(enlarged_masks(alpha[frame, None], SIZE)[0].numpy(force=True)).points
         start = (vertices + offsets[frame]).double().numpy()
-        moved = start
-        for _ in range(ROUNDS):
-            steps, share = outline_steps(torch.from_numpy(moved).float(), faces, target, camera, LONGEST)
-            pull = PULL * share
-            moved = moved + solve_screened(body.edges, pull + STAY, pull[:, None] * steps, steps)
-        kept = without_new_defects(start, moved, body.faces, body.edges, body.defective)
-        fitted[frame] = torch.from_numpy(kept - body.rest).to(offsets)
+        for _ in range(PASSES):
+            moved = start
+            for _ in range(ROUNDS):
+                steps, share = outline_steps(torch.from_numpy(moved).float(), faces, target, camera, LONGEST)
+                pull = PULL * share
+                moved = moved + solve_screened(body.edges, pull + STAY, pull[:, None] * steps, steps)
+            kept = without_new_defects(start, moved, body.faces, body.edges, body.defective)
+            undone, whole = moved - kept, moved - start
+            start = kept
+            if np.linalg.norm(undone) <= HELD * np.linalg.norm(whole):
+                break
+        fitted[frame] = torch.from_numpy(start - body.rest).to(offsets)
 
     run_parallel([partial(fit_frame, frame) for frame in range(len(offsets))])
     return fitted

@@ -7,6 +7,7 @@ import trimesh
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.folds import DefectFinder
+from dg4d_lib.mesh.tracking import outline_detail
 from dg4d_lib.mesh.tracking.outline_detail import fit_outline_detail
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
@@ -76,3 +77,15 @@ def test_no_new_defects() -> None:
     before, after = (finder.defective(shape.double().numpy()) for shape in (thin, thin + fitted[0]))
     assert fitted.any()
     assert not (after & ~before).any()
+
+
+def test_where_much_has_to_stay_the_rest_moves_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = ball()
+    thin = vertices * torch.tensor([1.0, 1.0, 0.03])
+    alpha = alpha_of(waved(thin, 0.02), faces)
+    errors = []
+    for passes in (1, outline_detail.PASSES):
+        monkeypatch.setattr(outline_detail, "PASSES", passes)
+        fitted = fit_outline_detail(thin, torch.zeros(1, *thin.shape), faces, alpha)
+        errors.append(1 - overlap(thin + fitted[0], faces, alpha))
+    assert errors[1] < 0.6 * errors[0]
