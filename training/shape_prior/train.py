@@ -111,7 +111,7 @@ class Run:
             "shown": self.shown,
             "curve": self.curve,
         }
-        torch.save(state, folder / f"{CHECKPOINT}.new")
+        torch.save(_on_cpu(state), folder / f"{CHECKPOINT}.new")
         (folder / f"{CHECKPOINT}.new").replace(folder / CHECKPOINT)
         save_network(self.average, folder / f"{WEIGHTS}.new")
         (folder / f"{WEIGHTS}.new").replace(folder / WEIGHTS)
@@ -263,6 +263,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
+
+
+def _on_cpu(value: Any) -> Any:
+    """Return nested dicts and lists with every tensor on the processor, so that a checkpoint needs no GPU to be read."""
+    if isinstance(value, Tensor):
+        return value.cpu()
+    if isinstance(value, dict):
+        return {key: _on_cpu(item) for key, item in value.items()}
+    return [_on_cpu(item) for item in value] if isinstance(value, list) else value
 
 
 def _config(state: dict[str, Any]) -> ShapePriorConfig:
