@@ -120,7 +120,7 @@ def test_every_command_has_an_example_and_every_example_is_a_command() -> None:
 
 @pytest.mark.parametrize("path", [path for path in DOCUMENTS if path not in {"docs/cli.md", "docs/settings.md"}])
 def test_every_setting_in_a_document_can_be_set(path: str) -> None:
-    pairs = re.findall(r"--set ([^\s`]+=[^\s`]+)", repository.text(path))
+    pairs = re.findall(r"--set '?([^\s`']+=[^\s`']+)", repository.text(path))
     for pair in pairs:
         revise(profile("preview"), parse_changes([pair]))
 
