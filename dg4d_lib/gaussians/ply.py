@@ -8,6 +8,7 @@ viewer. Files for them are written in these axes, half a turn around x from ours
 Niantic's reader refuses a header with a comment.
 """
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLUMNS = (*MEANS, *NORMALS, *COLORS, *OPACITY, *SCALES, *QUATS)
 
 MAX_HEADER = 65536  # bytes; bounds the search for `end_header`
+_HEADER = re.compile(rb"ply\r?\n(.*?)end_header\r?\n", re.DOTALL)
 _TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
 _TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "short": "<i2", "ushort": "<u2", "char": "i1"}
 
@@ -126,39 +128,47 @@ def check_storable(gaussians: Gaussians, form: str) -> None:
         )
 
 
+def header_text(content: bytes) -> bytes:
+    """Return the header of a PLY before `end_header`; empty without one."""
+    beginning = content[:MAX_HEADER]
+    return beginning[: max(0, beginning.find(b"end_header"))]
+
+
 def parse_header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], int]:
-    """Return the number of rows, their type, and the offset of the first.
+    """Return the number of vertices, the type of their rows, and the offset of the first.
 
     Args:
         name: of the file, for messages.
         beginning: first bytes of the file.
 
     Raises:
-        BadInput: it is no binary PLY of one element `vertex`.
+        BadInput: it is no binary PLY that begins with the element `vertex`.
     """
     elements, start = parse_elements(name, beginning)
-    if [kind for kind, _, _ in elements] != ["vertex"]:
+    if not elements or elements[0][0] != "vertex":
         raise BadInput(
-            f"{name} must hold one element, 'vertex'; given {[(kind, count) for kind, count, _ in elements]}"
+            f"{name} must begin with the element 'vertex'; given {[(kind, count) for kind, count, _ in elements]}"
         )
     _, count, dtype = elements[0]
     return count, dtype, start
 
 
 def parse_elements(name: str, beginning: bytes) -> tuple[list[tuple[str, int, np.dtype[np.void]]], int]:
-    """Return name, number of rows and row type of every element, in order, and the offset of the first row.
+    """Return name, number of rows and row type of the elements, in order, and the offset of the first row.
+
+    Elements after the first one are returned up to one that has rows of varying length.
 
     Args:
         name: of the file, for messages.
         beginning: first bytes of the file.
 
     Raises:
-        BadInput: it is no binary PLY, or has properties of varying length.
+        BadInput: it is no binary PLY, or its first element has rows of varying length.
     """
-    end = beginning.find(b"end_header\n")
-    if not beginning.startswith(b"ply\n") or end < 0:
+    header = _HEADER.match(beginning)
+    if header is None:
         raise BadInput(f"{name} is no PLY: it must start with 'ply' and have an 'end_header' line")
-    lines = [line.split() for line in beginning[:end].decode("ascii", "replace").splitlines()[1:]]
+    lines = [line.split() for line in header[1].decode("ascii", "replace").splitlines()]
     lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise BadInput(f"{name} must be 'format binary_little_endian 1.0'; export it in that format")
@@ -167,6 +177,9 @@ def parse_elements(name: str, beginning: bytes) -> tuple[list[tuple[str, int, np
         for words in lines:
             if words[0] == "element":
                 found.append((words[1], int(words[2]), []))
+            elif words[:2] == ["property", "list"] and len(found) > 1:
+                found.pop()
+                break
             elif words[0] == "property":
                 found[-1][2].append((words[2], _TYPES[words[1]]))
         elements = [(kind, count, np.dtype(properties)) for kind, count, properties in found]
@@ -174,4 +187,4 @@ def parse_elements(name: str, beginning: bytes) -> tuple[list[tuple[str, int, np
         raise BadInput(f"{name} has a header that cannot be read: {error!r}") from error
     if any(count < 0 for _, count, _ in elements):
         raise BadInput(f"{name} has a header that cannot be read: a negative number of rows")
-    return elements, end + len(b"end_header\n")
+    return elements, header.end()

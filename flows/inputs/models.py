@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from dg4d_lib.assets.formats.mtl import read_mtl
+from dg4d_lib.assets.formats.mtl import library_names, read_mtl
 from dg4d_lib.errors import BadInput
 from flows.inputs import json_text
 from flows.inputs.sources import LARGEST_FILE_BYTES, put_zip, resolve_inside
@@ -75,7 +75,7 @@ def _references(path: Path, suffix: str) -> Iterator[str]:
     if suffix == ".gltf":
         yield from _uris(_parsed(path))
     elif suffix == ".obj":
-        for name in _MATERIALS.findall(_text(path)):
+        for name in itertools.chain.from_iterable(map(library_names, _MATERIALS.findall(_text(path)))):
             yield name
             materials = path.parent / name
             if os.path.isfile(materials):  # noqa: PTH113 (any length of the name)

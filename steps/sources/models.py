@@ -18,7 +18,7 @@ from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb
 from dg4d_lib.assets.formats.foreign_splats import read_foreign_ply, read_spz
 from dg4d_lib.assets.formats.model_glb import write_model_glb
-from dg4d_lib.assets.formats.model_pictures import decode_picture
+from dg4d_lib.assets.formats.model_pictures import decode_picture, picture_type
 from dg4d_lib.assets.formats.obj import read_obj
 from dg4d_lib.assets.formats.ply_mesh import declared_faces, read_ply_mesh
 from dg4d_lib.errors import BadInput
@@ -182,7 +182,7 @@ def _embedded(tree: dict[str, Any], binary: bytes, folder: Path) -> bytes:
             view = {"buffer": 0, "byteOffset": total, "byteLength": len(data)}
             image["bufferView"] = len(tree.setdefault("bufferViews", []))
             image.setdefault("name", Path(uri).stem if not uri.startswith(DATA_URI) else "texture")
-            image["mimeType"] = "image/png" if data[:4] == b"\x89PNG" else "image/jpeg"
+            image["mimeType"] = picture_type(data)
             tree["bufferViews"].append(view)
             parts.append(data + bytes(-len(data) % 4))
             total += len(parts[-1])

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
-from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
+from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GlbReader, GltfDocument
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -33,6 +34,7 @@ from steps.artifacts.rendering import read_surface
 from steps.catalog import STEPS
 from steps.profiles import PREVIEW, revise, step_settings
 from steps.runtime.job import Job
+from steps.sources.models import embed_files
 
 SMALL = revise(
     PREVIEW,
@@ -293,6 +295,17 @@ def test_more_splats_than_allowed_are_merged_and_all_move(tmp_path: Path) -> Non
     shift = read_motion(moved.outputs["motion"]).deformation.displace(placed.means, torch.tensor([1.0])).means[0]
     assert shift.shape == (500, 3)
     assert (shift[:, 0] > 0.02).all()
+
+
+@pytest.mark.parametrize("kind", ["png", "webp", "jpeg"])
+def test_textures_beside_a_gltf_are_embedded_as_their_content_is(kind: str, tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "paint", kind)
+    document = GltfDocument({})
+    document.add("images", uri="paint")
+    reader = GlbReader(embed_files(document.to_bytes(), tmp_path))
+    (image,) = reader.tree["images"]
+    assert image["mimeType"] == f"image/{kind}"
+    assert bytes(reader.view(image["bufferView"])) == (tmp_path / "paint").read_bytes()
 
 
 REFUSED = {

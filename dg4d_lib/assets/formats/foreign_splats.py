@@ -17,12 +17,23 @@ from numpy.typing import NDArray
 from dg4d_lib.assets.formats.spz import LARGEST, MAGIC, SPZ4_HEADER
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.ply import COLORS, MAX_HEADER, MEANS, OPACITY, QUATS, SCALES, parse_elements, parse_header
+from dg4d_lib.gaussians.ply import (
+    COLORS,
+    MAX_HEADER,
+    MEANS,
+    OPACITY,
+    QUATS,
+    SCALES,
+    header_text,
+    parse_elements,
+    parse_header,
+)
 from dg4d_lib.geometry.spherical_harmonics import C0
 
 SPZ_HEADER = 16  # bytes, of the versions 2 and 3
 HIGHEST_DEGREE = 4  # of color in an SPZ
 MOST = 2_000_000  # splats that are read
+MIN_LOG_SCALE, MAX_LOGIT = -20.0, 20.0  # of splats; beyond these, they look the same
 CHUNK = 256  # splats of a compressed PLY that share bounds
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 HIGHER = "color of higher degrees was dropped: the splats keep their base color"
@@ -34,8 +45,7 @@ def read_foreign_ply(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple
     Raises:
         BadInput: the file is no splat PLY, lacks color, has too many splats or numbers that are not finite.
     """
-    beginning = content[:MAX_HEADER]
-    header = beginning[: max(0, beginning.find(b"end_header"))]
+    header = header_text(content)
     if b"\nelement chunk " in header:
         return _read_compressed_ply(content, most)
     if header and not {name.encode() for name in COLORS} <= set(header.split()):
@@ -43,7 +53,7 @@ def read_foreign_ply(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple
             "the PLY has no faces and no splat colors (f_dc_0, f_dc_1, f_dc_2), and points alone cannot be animated; "
             "give splats with color, or a mesh"
         )
-    count, dtype, start = parse_header("the model", beginning)
+    count, dtype, start = parse_header("the model", content[:MAX_HEADER])
     names = dtype.names or ()
     if missing := [name for name in (*MEANS, *OPACITY, *SCALES, *QUATS) if name not in names]:
         raise BadInput(f"the PLY holds no splats: it lacks {', '.join(missing)}; give splats, or a mesh with faces")
@@ -56,7 +66,7 @@ def read_foreign_ply(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple
         return np.stack([rows[name] for name in fields], 1).astype(np.float32)
 
     notes = (HIGHER,) if any(name.startswith("f_rest_") for name in names) else ()
-    return _cloud(*map(columns, (MEANS, SCALES, QUATS, OPACITY, COLORS))), notes
+    return _cloud(columns(MEANS), columns(SCALES), columns(QUATS), columns(OPACITY), columns(COLORS), notes)
 
 
 def read_spz(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple[str, ...]]:
@@ -88,8 +98,8 @@ def read_spz(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple[str, ..
     words[..., 1:] = places.reshape(count, 3, 3)  # the sign is in the highest byte
     means = (words.view("<i4")[..., 0] >> 8) / 2**bits
     quats = _first_three(turns) if version == 2 else _smallest_three(turns)
-    cloud = _cloud(means, scales / 16 - 10.0, quats, _logits(alphas / 255), (colors / 255 - 0.5) / 0.15)
-    return cloud, (HIGHER,) if degree else ()
+    notes = (HIGHER,) if degree else ()
+    return _cloud(means, scales / 16 - 10.0, quats, _logits(alphas / 255), (colors / 255 - 0.5) / 0.15, notes)
 
 
 def _spz4_sections(content: bytes, streams: int, sizes: list[int]) -> list[bytes]:
@@ -143,7 +153,7 @@ def _read_compressed_ply(content: bytes, most: int) -> tuple[Gaussians, tuple[st
     small = (_fields(turn, (20, 10, 0), 10) - 0.5) * np.sqrt(2)
     quats = _with_largest(small, turn >> 30)
     notes = (HIGHER,) if "sh" in rows else ()
-    return _cloud(means, scales, quats, _logits(rgba[:, 3:]), (colors - 0.5) / C0), notes
+    return _cloud(means, scales, quats, _logits(rgba[:, 3:]), (colors - 0.5) / C0, notes)
 
 
 def _fields(words: NDArray[np.int64], shifts: tuple[int, ...], bits: int) -> NDArray[np.float64]:
@@ -177,13 +187,23 @@ def _cloud(
     quats: NDArray[np.floating],
     opacity: NDArray[np.floating],
     colors: NDArray[np.floating],
-) -> Gaussians:
+    notes: tuple[str, ...],
+) -> tuple[Gaussians, tuple[str, ...]]:
+    """Return splats and notes; opacities and scales are limited, and rotations of length 0 become the identity.
+
+    Programs write opacities of 0 and 1 as infinite logits, and flat splats with a scale of 0.
+    """
     parts = [torch.from_numpy(np.array(values, np.float32)) for values in (means, log_scales, quats, opacity, colors)]
+    unturned = parts[2].norm(dim=1) == 0
+    changed = (parts[1] < MIN_LOG_SCALE).any(1) | (parts[3][:, 0].abs() > MAX_LOGIT) | unturned
+    parts[1].clamp_(min=MIN_LOG_SCALE)
+    parts[2][unturned] = torch.tensor((1.0, 0.0, 0.0, 0.0))
+    parts[3].clamp_(-MAX_LOGIT, MAX_LOGIT)
     if not all(part.isfinite().all() for part in parts):
         raise BadInput("the splats have numbers that are not finite (NaN or infinity); export them again")
-    if not (parts[2].norm(dim=1) > 0).all():
-        raise BadInput("some splats have a rotation of length 0; export them again")
-    return Gaussians(parts[0], parts[1], parts[2], parts[3][:, 0], parts[4][:, None])
+    if changed.any():
+        notes += (f"{int(changed.sum())} splats had an extreme opacity or size, or no rotation; they got usable ones",)
+    return Gaussians(parts[0], parts[1], parts[2], parts[3][:, 0], parts[4][:, None]), notes
 
 
 def _smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -11,6 +11,13 @@ from dg4d_lib.errors import BadInput
 MAX_IMAGE_PIXELS = 8192 * 8192
 
 
+def picture_type(content: bytes) -> str:
+    """Return the media type of a PNG, WebP or JPEG by its first bytes; that of JPEG for others."""
+    if content[:4] == b"\x89PNG":
+        return "image/png"
+    return "image/webp" if content[8:12] == b"WEBP" else "image/jpeg"
+
+
 def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
     """Decode a PNG, JPEG or WebP of a model as RGBA.
 

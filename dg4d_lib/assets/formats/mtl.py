@@ -29,16 +29,27 @@ def read_mtl(text: str) -> dict[str, Material]:
     """
     current, materials = Material(), {}
     for line in text.splitlines():
-        words = line.split("#", 1)[0].split()
-        if words[:1] == ["newmtl"]:
-            current = materials[" ".join(words[1:])] = Material()
-        elif words[:1] == ["Kd"] and len(words) >= 4:
-            red, green, blue = map(float, words[1:4])
-            if math.isfinite(red + green + blue):
-                current.color = (red, green, blue)
-        elif words[:1] == ["map_Kd"]:
-            current.textures = texture_names(line.split("#", 1)[0].strip().removeprefix("map_Kd").strip())
+        keyword, *rest = line.strip().split(None, 1) or [""]
+        words = " ".join(rest).split()
+        match keyword.lower():
+            case "newmtl":
+                current = materials[" ".join(words)] = Material()
+            case "kd" if len(words) >= 3:
+                red, green, blue = map(float, words[:3])
+                if math.isfinite(red + green + blue):
+                    current.color = (red, green, blue)
+            case "map_kd":
+                current.textures = texture_names(" ".join(rest))
     return materials
+
+
+def library_names(statement: str) -> tuple[str, ...]:
+    """Return the names that the MTL files of an OBJ may have: every word, and all as one name with spaces.
+
+    Args:
+        statement: what follows `mtllib`.
+    """
+    return tuple(dict.fromkeys((*statement.split(), statement)))
 
 
 def texture_names(statement: str) -> tuple[str, ...]:

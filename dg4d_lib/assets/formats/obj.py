@@ -8,13 +8,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats.mtl import Material, read_mtl
+from dg4d_lib.assets.formats.mtl import Material, library_names, read_mtl
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
 
 Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 _CONTINUED = re.compile(r"\\\r?\n")  # a backslash at the end of a line
+_NAMING = ("o", "g", "usemtl", "mtllib")  # statements of names, where "#" begins no comment
 
 
 @dataclass
@@ -40,14 +41,19 @@ def read_obj(text: str, read: Read, decode: Decode, max_faces: int) -> Model:
     """
     content = _Content(read, max_faces)
     for number, line in enumerate(_CONTINUED.sub(" ", text).splitlines(), 1):
-        words = line.split("#", 1)[0].split()
         try:
-            content.add(words)
+            content.add(_words(line))
         except (ValueError, IndexError) as error:
             raise BadInput(f"line {number} of the OBJ cannot be read ({error}); export the model again") from error
     if not content.faces:
         raise BadInput("the model has no faces; give a mesh with triangles")
     return content.model(decode)
+
+
+def _words(line: str) -> list[str]:
+    """Return the words of a line without its comment."""
+    words = line.split()
+    return words if words and words[0] in _NAMING else line.split("#", 1)[0].split()
 
 
 class _Content:
@@ -76,8 +82,9 @@ class _Content:
             case ["usemtl"]:
                 self.material = " ".join(words[1:])
             case ["mtllib"]:
-                content = self.read(" ".join(words[1:]))  # without it materials are gray, as in players
-                self.materials |= read_mtl((content or b"").decode("utf-8", "replace"))
+                for name in library_names(" ".join(words[1:])):
+                    content = self.read(name)  # without it materials are gray, as in players
+                    self.materials |= read_mtl((content or b"").decode("utf-8", "replace"))
             case ["f"]:
                 self.add_face([_corner(word, len(self.positions), len(self.uvs)) for word in words[1:]])
 
@@ -103,12 +110,13 @@ class _Content:
         colored = np.array(self.colors, float) if all(len(row) == 3 for row in self.colors) else None
         if colored is not None and not np.isfinite(colored).all():
             colored = None
-        coordinates = np.array(self.uvs, float).reshape(-1, 2)
+        coordinates = np.array([*self.uvs, (0.0, 1.0)])  # the last one, at index -1, is 0 0 of the file, as in players
+        unknown = Material() if colored is None else Material((1.0, 1.0, 1.0))
         pictures: dict[str, NDArray[np.uint8]] = {}
         parts = []
         for group in self.groups.values():
             if group.corners:
-                known = self.materials.get(group.material, Material())
+                known = self.materials.get(group.material, unknown)
                 texture = read_texture(known.textures, self.read, decode, pictures)
                 parts.append(_part(group, points, coordinates, colored, known, texture))
         return Model(tuple(parts))
@@ -157,7 +165,7 @@ def _part(
     texture: NDArray[np.uint8] | None,
 ) -> ModelPart:
     pairs, faces = np.unique(np.array(group.corners), axis=0, return_inverse=True)
-    textured = bool((pairs[:, 1] >= 0).all()) and len(uvs) > 0
+    textured = bool((pairs[:, 1] >= 0).any())
     factor = (1.0, 1.0, 1.0) if texture is not None else tuple(map(float, to_linear(np.array(material.color))))
     return ModelPart(
         f"{group.name} {group.material}".strip(),

@@ -10,24 +10,25 @@ import trimesh
 
 from dg4d_lib.assets.formats.obj import Decode, Read, read_texture
 from dg4d_lib.errors import BadInput
-from dg4d_lib.gaussians.ply import MAX_HEADER
+from dg4d_lib.gaussians.ply import header_text
 from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
 
 _FACES = re.compile(rb"^element face (\d+)", re.MULTILINE)
 _TEXTURE = re.compile(rb"^comment TextureFile\s+(.+?)\s*$", re.MULTILINE)
+_WIDE_COLORS = re.compile(rb"^property (ushort|uint16) (red|green|blue)\s*$", re.MULTILINE)  # trimesh cuts them
 _BROKEN = (ValueError, KeyError, IndexError, TypeError, AttributeError, ArithmeticError, OSError, struct.error)
 GRAY = 0.8  # of a mesh without color, sRGB; as of an OBJ
 
 
 def declared_faces(content: bytes) -> int:
     """Return the number of faces that the header of a PLY declares; 0 if there are none, as in splats."""
-    found = _FACES.search(_header(content))
+    found = _FACES.search(header_text(content))
     return int(found[1]) if found else 0
 
 
 def texture_file(content: bytes) -> str | None:
     """Return the name of the texture of a PLY."""
-    found = _TEXTURE.search(_header(content))
+    found = _TEXTURE.search(header_text(content))
     return found[1].decode("utf-8", "replace") if found else None
 
 
@@ -41,8 +42,8 @@ def read_ply_mesh(content: bytes, read: Read, decode: Decode, max_faces: int) ->
         max_faces: largest number of triangles.
 
     Raises:
-        BadInput: the file is broken, has no or too many triangles, numbers that are not finite, or its texture is
-            missing.
+        BadInput: the file is broken, has no or too many triangles, numbers that are not finite or colors of 16
+            bits, or its texture is missing.
     """
     count = declared_faces(content)
     if count > max_faces:
@@ -50,7 +51,9 @@ def read_ply_mesh(content: bytes, read: Read, decode: Decode, max_faces: int) ->
             f"the model has {count} faces; asset.max_faces allows {max_faces}: simplify it, or raise the limit with "
             f"--set asset.max_faces={count}"
         )
-    header = _header(content)
+    header = header_text(content)
+    if _WIDE_COLORS.search(header):
+        raise BadInput("the PLY has colors of 16 bits; export it with colors of 8 bits, or as GLB")
     try:
         mesh: Any = trimesh.load(
             io.BytesIO(header.replace(b"comment TextureFile", b"comment") + content[len(header) :]),
@@ -87,8 +90,3 @@ def _part(mesh: Any, texture: str | None, read: Read, decode: Decode) -> ModelPa
         (shade, shade, shade),
         colors,
     )
-
-
-def _header(content: bytes) -> bytes:
-    beginning = content[:MAX_HEADER]
-    return beginning[: max(0, beginning.find(b"end_header"))]

@@ -18,6 +18,7 @@ from dg4d_lib.mesh.models.model import Model, ModelPart
 
 MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
 GRAY = (0.5, 0.5, 0.5)  # of a material without a readable color, linear
+WHITE = (1.0, 1.0, 1.0)
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 
 
@@ -43,7 +44,7 @@ def check_usdz(path: Path) -> None:
 
 
 def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
-    """Read the visible meshes of a USDZ, at its first time, y up; a part per mesh and material.
+    """Read the rendered meshes of a USDZ, at its first time, y up; a part per mesh and material.
 
     Skeletons pose their meshes, and meshes of instances are read at every place.
 
@@ -53,7 +54,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
         max_faces: largest number of triangles.
 
     Raises:
-        BadInput: it cannot be read, or has no or too many triangles.
+        BadInput: it cannot be read, has a PointInstancer, or no or too many triangles.
     """
     try:
         stage = Usd.Stage.Open(str(path))
@@ -77,7 +78,14 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
         if number >= MAX_PRIMS:
             raise BadInput(f"the USD file has more than {MAX_PRIMS} objects; simplify it")
-        if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+        if not prim.IsA(UsdGeom.Boundable) or not _is_rendered(UsdGeom.Imageable(prim), time):
+            continue
+        if prim.IsA(UsdGeom.PointInstancer):
+            raise BadInput(
+                f"the USD file has meshes at many places (the PointInstancer {prim.GetName()[:80]!r}); export it "
+                "without instancing"
+            )
+        if not prim.IsA(UsdGeom.Mesh):
             continue
         found = list(_parts(UsdGeom.Mesh(prim), time, cache, upright, pictures))
         parts += found
@@ -94,6 +102,12 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     return Model(tuple(parts))
 
 
+def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:
+    """Tell if a prim is visible and neither a proxy of another one nor a guide."""
+    visible = prim.ComputeVisibility(time) != UsdGeom.Tokens.invisible
+    return visible and prim.ComputePurpose() not in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)
+
+
 def _parts(
     mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], pictures: "_Pictures"
 ) -> Iterator[ModelPart]:
@@ -102,27 +116,31 @@ def _parts(
     points = np.array(mesh.GetPointsAttr().Get(time) or [], float).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
     indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
-    if not len(counts) or counts.min() < 3:
+    if not counts.any():
         return
-    if counts.sum() != len(indices) or indices.min() < 0 or indices.max() >= len(points):
+    if counts.min() < 0 or counts.sum() != len(indices) or indices.min() < 0 or indices.max() >= len(points):
         raise BadInput("the faces of a mesh in the USD file do not fit its points; export it again")
     corners = _fans(counts)  # three positions in `indices` per triangle
     if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
         corners = corners[:, ::-1]
     names = [primvar.GetPrimvarName() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars() if _is_uv(primvar)]
-    uvs = _per_corner(prim, ("st", "UVMap", "st0", *names), indices, time)
-    colors = _per_corner(prim, ("displayColor",), indices, time)
+    uvs = _per_corner(prim, ("st", "UVMap", "st0", *names), indices, counts, time)
+    colors = _per_corner(prim, ("displayColor",), indices, counts, time)
     matrix = np.array(cache.GetLocalToWorldTransform(prim))  # row vectors
     placed = ((points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T).astype(np.float32)
-    polygons = np.repeat(np.arange(len(counts)), counts - 2)  # of the triangles
+    polygons = np.repeat(np.arange(len(counts)), (counts - 2).clip(0))  # of the triangles
     for owner, chosen in _faces_by_material(mesh, len(counts), time):
         triangles = corners[chosen[polygons]]
         if not len(triangles):
             continue
         color = _material(owner, pictures)
         shown = colors if color is None else None
-        texture, factor = (None, GRAY if shown is None else (1.0, 1.0, 1.0)) if color is None else color
-        coordinates = uvs if texture is not None else None
+        if color is None:
+            color = None, GRAY if shown is None else WHITE
+        elif color[0] is not None and uvs is None:
+            color = None, GRAY
+        texture, factor = color
+        coordinates = None if texture is None else uvs
         rows = [indices[:, None].astype(float), *(values for values in (coordinates, shown) if values is not None)]
         unique, faces = np.unique(np.concatenate(rows, 1)[triangles.ravel()], axis=0, return_inverse=True)
         yield ModelPart(
@@ -130,8 +148,8 @@ def _parts(
             placed[unique[:, 0].astype(np.int64)],
             faces.reshape(-1, 3),
             None if coordinates is None else np.stack([unique[:, 1], 1 - unique[:, 2]], 1),
-            None if coordinates is None else texture,
-            (1.0, 1.0, 1.0) if coordinates is not None else factor,
+            texture,
+            factor,
             None if shown is None else unique[:, 1:],
         )
 
@@ -154,12 +172,15 @@ def _is_uv(primvar: Any) -> bool:
 
 def _fans(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the corners of the triangles that polygons with these numbers of corners are split into."""
-    starts = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    number = np.arange(len(starts)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    triangles = (counts - 2).clip(0)
+    starts = np.repeat(np.cumsum(counts) - counts, triangles)
+    number = np.arange(len(starts)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
     return np.stack([starts, starts + number + 1, starts + number + 2], 1)
 
 
-def _per_corner(prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], time: Any) -> NDArray[np.float64] | None:
+def _per_corner(
+    prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], counts: NDArray[np.int64], time: Any
+) -> NDArray[np.float64] | None:
     """Return the values of the first existing primvar at every corner; None if it cannot be used."""
     api = UsdGeom.PrimvarsAPI(prim)
     for name in names:
@@ -173,24 +194,39 @@ def _per_corner(prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], t
                 return values
             case UsdGeom.Tokens.vertex | UsdGeom.Tokens.varying if len(values) > indices.max():
                 return values[indices]
+            case UsdGeom.Tokens.uniform if len(values) == len(counts):
+                return np.repeat(values, counts, 0)
             case UsdGeom.Tokens.constant if len(values):
                 return np.repeat(values[:1], len(indices), 0)
     return None
 
 
 def _material(prim: Any, pictures: "_Pictures") -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]] | None:
-    """Return the base color texture and the linear base color of a prim's material; None if it has no color."""
+    """Return the base color texture and the linear factor of a prim's material; None if it has no color."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0] if material else None
-    color = shader.GetInput("diffuseColor") if shader else None
-    if not color:
+    source = _source(shader, "diffuseColor") if shader else None
+    if source is None:
         return None
-    if not color.HasConnectedSource():
-        value = color.Get()
-        return None if value is None else (None, (float(value[0]), float(value[1]), float(value[2])))
-    file = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim()).GetInput("file")
-    picture = file.Get() if file else None
-    return None if picture is None else (pictures.read(picture), GRAY)
+    if UsdShade.Utils.GetType(source.GetName()) == UsdShade.AttributeType.Input:
+        value = source.Get()
+        return None if value is None else (None, _rgb(value))
+    texture = UsdShade.Shader(source.GetPrim())
+    picture, scale = (found and found.Get() for found in (_source(texture, "file"), _source(texture, "scale")))
+    if picture is None:
+        return None
+    return pictures.read(picture), WHITE if scale is None else _rgb(scale)  # the scale is of linear values
+
+
+def _source(shader: UsdShade.Shader, name: str) -> Any:
+    """Return the attribute that an input gets its value from: itself, an input of a material, or an output."""
+    found = shader.GetInput(name)
+    attributes = found.GetValueProducingAttributes() if found else ()
+    return attributes[0] if attributes else None
+
+
+def _rgb(value: Any) -> tuple[float, float, float]:
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 class _Pictures:

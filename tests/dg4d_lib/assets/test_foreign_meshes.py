@@ -100,6 +100,45 @@ def test_texture_coordinates_that_are_missing_are_left_out() -> None:
     assert part.uvs is None and len(part.faces) == 1
 
 
+def middle(part: ModelPart) -> list[float]:
+    """Return the color in the middle of the first triangle."""
+    color: list[float] = part.sample(np.array([0]), np.full((1, 3), 1 / 3))[0][0].tolist()
+    return color
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+def test_colors_of_vertices_without_a_material_are_kept() -> None:
+    text = TRIANGLE.replace("\n", " 1 0.5 0.25\n") + "f 1 2 3\n"
+    (part,) = read_obj(text, FILES.get, decode_picture, 100).parts
+    assert middle(part) == pytest.approx([1, 0.5, 0.25], abs=1e-5)
+
+
+def test_a_number_sign_in_a_name_begins_no_comment() -> None:
+    files = {"set #1.mtl": b"newmtl M #1\nmap_Kd p #1.png\nnewmtl M #2\nKd 0 1 0 # green\n"}
+    files["p #1.png"] = png(RED_AND_BLUE)
+    text = f"# mtllib none\nmtllib set #1.mtl\n{TRIANGLE}vt 0.25 0.5 # left\n"
+    text += "usemtl M #1\nf 1/1 2/1 3/1 # a face\nusemtl M #2\nf 1 2 3\n"
+    red, green = read_obj(text, files.get, decode_picture, 100).parts
+    assert (red.name, green.name) == ("model M #1", "model M #2")
+    assert middle(red) == pytest.approx([1, 0, 0], abs=1e-5) and middle(green) == pytest.approx([0, 1, 0], abs=1e-5)
+
+
+def test_a_corner_without_texture_coordinates_leaves_the_others_textured() -> None:
+    model = read_obj(OBJ.replace("4/2/1", "4"), FILES.get, decode_picture, 100)
+    assert middle(model.parts[0]) == pytest.approx([1, 0, 0], abs=1e-5)
+    np.testing.assert_array_equal(model.parts[0].uvs[model.parts[0].faces[1, 2]], (0, 1))
+
+
+@pytest.mark.parametrize("names", ["a.mtl b.mtl", "b.mtl a.mtl", "a b.mtl"])
+def test_materials_are_found_in_every_file_named(names: str) -> None:
+    red = b"newmtl A\nkd 1 0 0\n"
+    files = {"a.mtl": red, "b.mtl": b"newmtl B\nKd 0 0 1\n"} if names != "a b.mtl" else {names: red}
+    (part,) = read_obj(f"mtllib {names}\n{TRIANGLE}usemtl A\nf 1 2 3\n", files.get, decode_picture, 100).parts
+    assert middle(part) == pytest.approx([1, 0, 0], abs=1e-5)
+
+
 PLY = """ply
 format ascii 1.0
 comment TextureFile  my paint.png
@@ -165,8 +204,9 @@ def test_ply_with_colors(of: str, encoding: str) -> None:
         (PLY.replace("1 1 0 0.25", "1 nan 0 0.25").replace("comment TextureFile", "comment"), "not finite"),
         (PLY[:-20], "cannot be read"),
         (PLY.replace("property float y", "property taste y"), "cannot be read"),
+        (PLY.replace("property float t", "property float t\nproperty ushort red"), "colors of 16 bits"),
     ],
-    ids=["no texture", "too many", "far index", "nan", "cut", "unknown type"],
+    ids=["no texture", "too many", "far index", "nan", "cut", "unknown type", "wide colors"],
 )
 def test_broken_ply_gets_a_sentence(text: str, sentence: str) -> None:
     with pytest.raises(BadInput, match=sentence):
@@ -244,6 +284,78 @@ def test_usd_meshes_of_several_materials_have_a_part_for_each(tmp_path: Path) ->
     assert (lid.name, len(lid.faces), lid.factor) == ("box lid", 2, (0, 0, 1))
     assert (rest.name, len(rest.faces), rest.factor) == ("box", 10, (1, 0, 0))
     np.testing.assert_array_equal(lid.vertices[lid.faces], CORNERS[BOX[:2]])
+
+
+def test_usd_meshes_that_renderers_leave_out_are_not_read(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    for purpose in ("default", "render", "proxy", "guide"):
+        UsdGeom.Imageable(UsdGeom.Xform.Define(stage, f"/{purpose}")).CreatePurposeAttr(purpose)
+        box_of(stage, f"/{purpose}/{purpose}_box")
+    box_of(stage, "/hidden").MakeInvisible()
+    model = read_usd(packed(tmp_path, stage), decode_picture, 100)
+    assert [part.name for part in model.parts] == ["default_box", "render_box"]
+
+
+@pytest.mark.parametrize("visible", [True, False])
+def test_usd_point_instancers_are_refused_where_they_are_rendered(visible: bool, tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    box_of(stage, "/box")
+    instancer = UsdGeom.PointInstancer.Define(stage, "/forest")
+    box_of(stage, "/forest/tree")
+    if visible:
+        with pytest.raises(BadInput, match=r"the PointInstancer 'forest'\); export it without instancing"):
+            read_usd(packed(tmp_path, stage), decode_picture, 100)
+    else:
+        instancer.MakeInvisible()
+        assert [part.name for part in read_usd(packed(tmp_path, stage), decode_picture, 100).parts] == ["box"]
+
+
+def test_usd_faces_of_two_corners_are_left_out(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh = box_of(stage, "/box")
+    mesh.GetFaceVertexCountsAttr().Set([2, *[3] * 11, 1])
+    colors = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "uniform")
+    colors.Set([Gf.Vec3f(1, 0, 0), Gf.Vec3f(0, 1, 0), *[Gf.Vec3f(0, 0, 1)] * 11])
+    (part,) = read_usd(packed(tmp_path, stage), decode_picture, 100).parts
+    np.testing.assert_array_equal(part.vertices[part.faces], CORNERS[BOX.ravel()[2:35].reshape(11, 3)])
+    np.testing.assert_allclose(part.colors[part.faces][:, 0], [(0, 1, 0), *[(0, 0, 1)] * 10])
+
+
+@pytest.mark.parametrize("counts", [[3] * 11 + [4], [-1, 37]])
+def test_usd_faces_that_do_not_fit_are_refused(counts: list[int], tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    box_of(stage, "/box").GetFaceVertexCountsAttr().Set(counts)
+    with pytest.raises(BadInput, match="do not fit its points"):
+        read_usd(packed(tmp_path, stage), decode_picture, 100)
+
+
+def test_usd_colors_may_be_inputs_of_the_material(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh, material = box_of(stage, "/box"), material_of(stage, "/paint", (1, 0, 0))
+    tint = material.CreateInput("tint", Sdf.ValueTypeNames.Color3f)
+    tint.Set(Gf.Vec3f(0, 1, 0))
+    UsdShade.Shader(stage.GetPrimAtPath("/paint/surface")).GetInput("diffuseColor").ConnectToSource(tint)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    (part,) = read_usd(packed(tmp_path, stage), decode_picture, 100).parts
+    assert part.factor == (0, 1, 0)
+
+
+def test_usd_textures_may_be_inputs_of_the_material_and_are_scaled(tmp_path: Path) -> None:
+    (tmp_path / "p.png").write_bytes(png(RED_AND_BLUE))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh, material = box_of(stage, "/box"), material_of(stage, "/paint", (0, 1, 0))
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "constant").Set([(0.25, 0.5)])
+    texture = UsdShade.Shader.Define(stage, "/paint/texture")
+    texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(0.2, 1, 1, 1))
+    file = material.CreateInput("file", Sdf.ValueTypeNames.Asset)
+    file.Set(Sdf.AssetPath("p.png"))
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).ConnectToSource(file)
+    color = UsdShade.Shader(stage.GetPrimAtPath("/paint/surface")).GetInput("diffuseColor")
+    color.ConnectToSource(texture.ConnectableAPI(), "rgb")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    (part,) = read_usd(packed(tmp_path, stage), decode_picture, 100).parts
+    red_in_srgb = 0.4845  # of 0.2 in linear light
+    assert middle(part) == pytest.approx([red_in_srgb, 0, 0], abs=1e-4)
 
 
 def test_usd_instances_are_read_at_every_place(tmp_path: Path) -> None:

@@ -179,9 +179,48 @@ def test_broken_spz_gets_a_sentence(content: bytes) -> None:
         read_spz(content, 100)
 
 
-def test_nan_in_splats_is_refused(cloud: Gaussians, tmp_path: Path) -> None:
+def rewritten(cloud: Gaussians, folder: Path, further: str = "", end: str = "\n") -> bytes:
+    """Return splats as a PLY with further lines at the end of its header, and with other ends of lines."""
+    write_ply(folder / "a.ply", cloud)
+    header, rows = (folder / "a.ply").read_bytes().split(b"end_header\n", 1)
+    return (header.decode() + further + "end_header\n").replace("\n", end).encode() + rows
+
+
+@pytest.mark.parametrize(
+    "further",
+    [
+        "element intrinsic 9\nproperty float intrinsic\n",
+        "element face 0\nproperty list uchar int vertex_indices\nelement frame 2\nproperty int frame\n",
+    ],
+    ids=["of SHARP", "a list"],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_further_elements_and_windows_lines_are_read_over(
+    further: str, end: str, cloud: Gaussians, tmp_path: Path
+) -> None:
+    read, notes = read_foreign_ply(rewritten(cloud, tmp_path, further, end) + bytes(36), 100)
+    assert all(torch.equal(getattr(read, field.name), getattr(cloud, field.name)) for field in fields(cloud))
+    assert notes == ()
+
+
+def test_extreme_splats_become_usable_and_are_counted(cloud: Gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", cloud)
+    header, rows = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    table = np.frombuffer(rows, "<f4").reshape(20, 17).copy()
+    table[[0, 1], 9], table[2, 10], table[3, 13:] = (np.inf, -np.inf), -np.inf, 0
+    read, notes = read_foreign_ply(header + b"end_header\n" + table.tobytes(), 100)
+    assert read.opacities[:2].tolist() == pytest.approx([1, 0], abs=1e-6)
+    assert read.scales[2, 0].item() == pytest.approx(0, abs=1e-6)
+    assert torch.equal(quat_to_rotmat(read.quats[3]), torch.eye(3))
+    assert torch.equal(read.quats[:3], cloud.quats[:3]) and torch.equal(read.log_scales[3:], cloud.log_scales[3:])
+    assert len(notes) == 1 and notes[0].startswith("4 splats")
+
+
+@pytest.mark.parametrize("column", [0, 9, 10, 13], ids=["mean", "opacity", "scale", "rotation"])
+def test_nan_of_any_kind_is_refused(column: int, cloud: Gaussians, tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", cloud)
     content = bytearray((tmp_path / "a.ply").read_bytes())
-    content[-4:] = struct.pack("<f", float("nan"))
+    start = len(content) - 17 * 4 + column * 4  # of the last splat
+    content[start : start + 4] = struct.pack("<f", float("nan"))
     with pytest.raises(BadInput, match="not finite"):
         read_foreign_ply(bytes(content), 100)

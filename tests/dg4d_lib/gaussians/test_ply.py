@@ -114,6 +114,7 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
         (lambda content: content.replace(b"binary_little_endian", b"ascii"), "binary_little_endian"),
         (lambda content: content.replace(b"vertex 7", b"vertex x"), "header"),
         (lambda content: content.replace(b"vertex 7", b"face 7"), "'vertex'"),
+        (lambda content: content.replace(b"float nx", b"list uchar float nx"), "header"),
         (lambda content: content.replace(b"property float nx", b"property float f_rest_0"), "higher degree"),
         (lambda content: content[:-4] + np.float32(np.nan).tobytes(), "non-finite"),
     ],

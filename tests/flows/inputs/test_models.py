@@ -52,6 +52,13 @@ def test_textures_with_spaces_in_their_names_come_along(statement: str, tmp_path
     assert entries(tmp_path / "x.obj", store) == ["model.obj", "a.mtl", "my paint.png"]
 
 
+def test_an_obj_comes_with_all_of_its_materials(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.obj").write_text("mtllib a.mtl b.mtl\nv 0 0 0\n")
+    for name in ("a.mtl", "b.mtl"):
+        (tmp_path / name).write_text("newmtl a\n")
+    assert entries(tmp_path / "x.obj", store) == ["model.obj", "a.mtl", "b.mtl"]
+
+
 def test_a_ply_comes_with_its_texture(tmp_path: Path, store: ArtifactStore) -> None:
     (tmp_path / "x.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile my paint.png\nend_header\n")
     (tmp_path / "my paint.png").write_bytes(b"1")
