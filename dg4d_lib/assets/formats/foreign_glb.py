@@ -347,8 +347,9 @@ def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
     faces, notes = 0, []
     for node in nodes:
         for primitive in tree["meshes"][tree["nodes"][node]["mesh"]]["primitives"]:
-            accessor = primitive.get("indices", primitive["attributes"]["POSITION"])
-            faces += tree["accessors"][accessor]["count"] // 3 if primitive.get("mode", 4) == TRIANGLES else 0
+            count = tree["accessors"][primitive.get("indices", primitive["attributes"]["POSITION"])]["count"]
+            most = {TRIANGLES: count // 3, STRIP: count - 2, FAN: count - 2}
+            faces += max(0, most.get(primitive.get("mode", TRIANGLES), 0))
     if faces > max_faces:
         raise BadInput(
             f"the model has {faces} triangles; asset.max_faces allows {max_faces}: simplify it, or raise the limit "

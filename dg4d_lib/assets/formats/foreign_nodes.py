@@ -1,6 +1,6 @@
 """Nodes and skins of a glTF of another program: where its meshes are."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,17 @@ MAX_GROUPS = 4  # of four joints per vertex
 Matrices = dict[int, NDArray[np.float64]]  # "4 4" per node
 
 
-def global_matrices(tree: dict[str, Any]) -> Matrices:
-    """Return the global matrix of every node of the scene."""
+def global_matrices(tree: dict[str, Any], unscaled: Container[int] = ()) -> Matrices:
+    """Return the global matrix of every node of the scene, parents before their children.
+
+    Args:
+        tree: of the file; without scenes it gets one with all nodes.
+        unscaled: nodes whose own scale counts as 1.
+
+    Raises:
+        BadInput: too many nodes, a node that is reached twice, or nodes that are nested too deeply.
+        KeyError, IndexError, TypeError, ValueError: the JSON is broken.
+    """
     nodes = tree.get("nodes", [])
     if len(nodes) > MAX_NODES:
         raise BadInput(f"the model has {len(nodes)} nodes; at most {MAX_NODES} are read")
@@ -31,7 +40,8 @@ def global_matrices(tree: dict[str, Any]) -> Matrices:
         index, parent, depth = waiting.pop()
         if index in found or depth > MAX_DEPTH:
             raise BadInput("the nodes of the model form a circle or are nested too deeply; export it again")
-        found[index] = parent @ _local_matrix(nodes[index])
+        node = nodes[index] if index not in unscaled else {**nodes[index], "scale": (1, 1, 1)}
+        found[index] = parent @ _local_matrix(node)
         waiting += [(child, found[index], depth + 1) for child in nodes[index].get("children", ())]
     return found
 

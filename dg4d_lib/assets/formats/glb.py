@@ -21,6 +21,7 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.formats.foreign_nodes import global_matrices
 from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, to_uint8
 from dg4d_lib.assets.formats.morph_components import fit_components, principal_components
@@ -238,14 +239,14 @@ def _add_components(
 ) -> int:
     """Add a node with principal components as morph targets; return its index."""
     components, weights = principal_components(offsets, settings.components)
+    # Integers stand for offsets inside the cube and changes in [-1, 1]; larger weights make up for smaller components.
+    reach = shape.component_reach(components)
     changes: Sequence[NDArray[np.float32] | None] = [None] * len(components)
     if settings.moving_normals:
         turned = fit_components(np.stack([shape.turn_normals(pose) for pose in offsets]), weights)
-        reach = (
-            np.abs(turned).max((1, 2)).clip(1)
-        )  # integers stand for changes in [-1, 1]; larger weights make up for it
-        components, turned = (rows / reach[:, None, None] for rows in (components, turned))
-        weights, changes = weights * reach, list(turned)
+        reach = np.maximum(reach, np.abs(turned).max((1, 2)))
+        changes = list(turned / reach[:, None, None])
+    components, weights = components / reach[:, None, None], weights * reach
     names = [f"component_{number:03d}" for number in range(len(components))]
     targets = [
         shape.add_component(name, component, change)
@@ -356,20 +357,14 @@ def _read_mesh(parsed: GlbReader, nodes: list[int]) -> TexturedMesh:
 
 def _placement(parsed: GlbReader, node: int) -> tuple[float, NDArray[np.float64]]:
     """Return world scale and origin of a node; an animated scale (which shows and hides nodes) counts as 1."""
-    tree, scale, shift = parsed.tree, 1.0, np.zeros(3)
+    tree = parsed.tree
     targets = [channel["target"] for animation in tree.get("animations", []) for channel in animation["channels"]]
     shown = {target["node"] for target in targets if target["path"] == "scale"}
-    parents = {child: number for number, item in enumerate(tree["nodes"]) for child in item.get("children", ())}
-    current: int | None = node
-    while current is not None:
-        item = tree["nodes"][current]
-        scales = [1.0] * 3 if current in shown else item.get("scale", [1.0] * 3)
-        if {"matrix", "rotation"} & item.keys() or len(set(scales)) > 1:
-            raise BadInput("the mesh of this GLB has a transform; apply the transform and export it again")
-        shift = shift * scales[0] + item.get("translation", np.zeros(3))
-        scale *= scales[0]
-        current = parents.get(current)
-    return scale, shift
+    matrix = global_matrices(tree, unscaled=shown)[node]
+    scale = float(matrix[0, 0])
+    if not np.array_equal(matrix[:3, :3], scale * np.eye(3)):
+        raise BadInput("the mesh of this GLB has a transform; apply the transform and export it again")
+    return scale, matrix[:3, 3]
 
 
 def _blend(parsed: GlbReader, targets: dict[int, float], mesh: TexturedMesh) -> NDArray[np.float32]:

@@ -172,7 +172,7 @@ class GlbReader:
             (text_length,) = struct.unpack_from("<I", content, 12)
             self.tree: dict[str, Any] = json.loads(content[20 : 20 + text_length])
             (binary_length,) = struct.unpack_from("<I", content, 20 + text_length)
-        except (struct.error, ValueError) as error:
+        except (struct.error, ValueError, RecursionError) as error:
             raise BadInput(f"this GLB is corrupt ({error}); export it again") from error
         start = 28 + text_length
         if version != 2 or length != len(content) or start + binary_length > len(content):
@@ -187,13 +187,13 @@ class GlbReader:
 
         Raises:
             BackendUnavailable: the view is compressed and meshoptimizer is missing.
+            BadInput: it cannot be decompressed.
         """
         view = self.tree["bufferViews"][index]
         packed = view.get("extensions", {}).get(meshopt.EXTENSION)
         if packed is None:
             return self._bytes(view)
-        unpack = {"ATTRIBUTES": meshopt.unpack_vertices, "TRIANGLES": meshopt.unpack_triangles}[packed["mode"]]
-        return unpack(self._bytes(packed), packed["count"], packed["byteStride"])
+        return meshopt.unpack(self._bytes(packed), packed)
 
     def raw_view(self, index: int) -> bytes:
         """Return the bytes of a buffer view as stored, compressed or not."""

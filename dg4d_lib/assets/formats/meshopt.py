@@ -1,5 +1,6 @@
-"""EXT_meshopt_compression: lossless compression of vertices and triangles with the reference library."""
+"""EXT_meshopt_compression with the reference library: lossless compression, and decompression of all its modes."""
 
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -10,6 +11,15 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 
 EXTENSION = "EXT_meshopt_compression"
 VERTEX_FORMAT, INDEX_FORMAT = 0, 1  # codec versions that the extension prescribes
+_FILTERS = {"OCTAHEDRAL": "decode_filter_oct", "QUATERNION": "decode_filter_quat", "EXPONENTIAL": "decode_filter_exp"}
+_STRIDES: dict[tuple[str, str], Sequence[int]] = {  # bytes per row that modes and filters of the extension allow
+    ("TRIANGLES", "NONE"): (2, 4),
+    ("INDICES", "NONE"): (2, 4),
+    ("ATTRIBUTES", "NONE"): range(4, 257, 4),
+    ("ATTRIBUTES", "OCTAHEDRAL"): (4, 8),
+    ("ATTRIBUTES", "QUATERNION"): (8,),
+    ("ATTRIBUTES", "EXPONENTIAL"): range(4, 257, 4),
+}
 
 
 def pack_vertices(rows: NDArray[Any]) -> bytes:
@@ -23,20 +33,6 @@ def pack_vertices(rows: NDArray[Any]) -> bytes:
     return library.encode_vertex_buffer(rows, len(rows), rows[0].nbytes)
 
 
-def unpack_vertices(content: bytes, count: int, stride: int) -> bytes:
-    """Decompress the output of `pack_vertices`.
-
-    Raises:
-        BackendUnavailable: meshoptimizer is missing.
-        BadInput: the content is corrupt.
-    """
-    library = _library()
-    try:
-        return library.decode_vertex_buffer(count, stride, content, np.dtype((np.void, stride))).tobytes()
-    except RuntimeError as error:
-        raise BadInput(f"the vertices of this GLB cannot be decompressed ({error}); export the file again") from error
-
-
 def pack_triangles(indices: NDArray[Any]) -> bytes:
     """Compress three indices per triangle; decompression may rotate them, (1, 2, 0) for (0, 1, 2).
 
@@ -48,18 +44,36 @@ def pack_triangles(indices: NDArray[Any]) -> bytes:
     return library.encode_index_buffer(indices.ravel(), indices.size, int(indices.max()) + 1)
 
 
-def unpack_triangles(content: bytes, count: int, size: int) -> bytes:
-    """Decompress the output of `pack_triangles` to unsigned integers of 2 or 4 bytes.
+def unpack(content: bytes, packed: dict[str, Any]) -> bytes:
+    """Decompress a buffer view.
+
+    Args:
+        content: compressed bytes.
+        packed: extension of the view, with `count`, `byteStride`, `mode` and, optionally, `filter`.
 
     Raises:
         BackendUnavailable: meshoptimizer is missing.
-        BadInput: the content is corrupt.
+        BadInput: the content is corrupt, or the extension has no such mode, filter or stride.
+        KeyError, TypeError, ValueError: the JSON is broken.
     """
-    library = _library()
+    library, count, stride = _library(), packed["count"], packed["byteStride"]
+    mode, name = packed["mode"], packed.get("filter", "NONE")
+    if stride not in _STRIDES.get((mode, name), ()):
+        raise BadInput(
+            f"this GLB is compressed with mode {mode!r}, filter {name!r} and {stride} bytes per row, which "
+            f"{EXTENSION} does not allow; export it without compression"
+        )
     try:
-        return library.decode_index_buffer(count, np.uint32().nbytes, content).astype(f"<u{size}").tobytes()
+        if mode == "ATTRIBUTES":
+            rows = library.decode_vertex_buffer(count, stride, content, np.dtype((np.void, stride)))
+        else:
+            decode = library.decode_index_buffer if mode == "TRIANGLES" else library.decode_index_sequence
+            rows = decode(count, np.uint32().nbytes, content).astype(f"<u{stride}")
     except RuntimeError as error:
-        raise BadInput(f"the triangles of this GLB cannot be decompressed ({error}); export the file again") from error
+        raise BadInput(f"this GLB cannot be decompressed ({error}); export the file again") from error
+    if name != "NONE":
+        rows = getattr(library, _FILTERS[name])(rows, count, stride)
+    return rows.tobytes()
 
 
 def order_for_compression(

@@ -164,6 +164,13 @@ class MeshPrimitive:
             target["NORMAL"] = self._add(f"{name} normals", changes)
         return target
 
+    def component_reach(self, components: Floats) -> Floats:
+        """Return the factor, at least 1, by which each component is too large for integer offsets."""
+        if self._cube is None:
+            return np.ones(len(components), np.float32)
+        reach: Floats = (np.abs(components).max((1, 2)) * np.float32(_ROOM / self._cube.half_side)).clip(1)
+        return reach
+
     def add_component(self, name: str, offsets: Floats, changes: Floats | None) -> dict[str, int]:
         """Add a morph target with given changes of normals, if any; return its accessor indices."""
         target = {"POSITION": self._add_offsets(name, offsets)}

@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dg4d_lib.assets.formats.foreign_nodes import global_matrices
 from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.assets.formats.tracks import POINTER
 from dg4d_lib.assets.scenes.scene import SceneItem
@@ -27,7 +27,8 @@ ANIMATION = "scene"
 SHORTEST_S = 1e-4  # minimum distance of keys, seconds; closer keys are merged
 MAX_LOOPS = 10_000  # of an animation; each loop repeats its keys in the file
 Vector = Float[np.ndarray, " 3"]
-_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError)  # raised by files of other layouts
+# Raised by files of other layouts.
+_FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, RecursionError)
 
 
 class AnimatedGlb:
@@ -50,7 +51,9 @@ class AnimatedGlb:
         """
         self.file = GlbReader(content)
         try:
-            poses = [pose for root in self.roots for pose in self._poses(root, np.eye(4))]
+            matrices = global_matrices(self.file.tree, unscaled=self._toggled)
+            # Backwards, the meshes are in the order of the file, so that the first pose is that of frame 0.
+            poses = [pose for node in reversed(matrices) for pose in self._poses(node, matrices[node])]
             if not poses:
                 raise BadInput("this GLB has no mesh; give an asset that `dg4d make` wrote")
             self.box_min: Vector = np.min([pose.min(0) for pose in poses], axis=0)
@@ -85,17 +88,16 @@ class AnimatedGlb:
     def _samplers(self) -> list[dict[str, Any]]:
         return list(self.animation["samplers"])
 
-    @cached_property
+    @property
     def _toggled(self) -> set[int]:
         """Nodes that an animated scale shows and hides; they count as shown."""
         targets = (channel["target"] for channel in self.animation["channels"])
         return {target["node"] for target in targets if target["path"] == "scale"}
 
-    def _poses(self, number: int, parent: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "v 3"]]:
-        """Return the world positions of all vertices below a node, in all poses."""
+    def _poses(self, number: int, matrix: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "v 3"]]:
+        """Return the world positions of all vertices of a node with this global matrix, in all poses."""
         node = self.file.tree["nodes"][number]
-        matrix = parent @ _local_matrix(node, ignore_scale=number in self._toggled)
-        poses = [pose for child in node.get("children", ()) for pose in self._poses(child, matrix)]
+        poses = []
         if "mesh" in node:
             for primitive in self.file.tree["meshes"][node["mesh"]]["primitives"]:
                 rest = self.file.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
@@ -372,14 +374,3 @@ def _cover_period(
     if keys[-1] < period - SHORTEST_S:
         keys, rows = np.append(keys, period), np.append(rows, rows[-1:], axis=0)
     return keys, rows
-
-
-def _local_matrix(node: dict[str, Any], ignore_scale: bool) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix from a node to its parent."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
-    scale = np.ones(3) if ignore_scale else np.array(node.get("scale", (1.0, 1.0, 1.0)))
-    matrix[:3, :3] = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix() * scale
-    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-    return matrix

@@ -1,7 +1,8 @@
 """One texture for all parts of a model, for viewers and formats that take one.
 
-Textures become tiles of a grid. Parts without texture get two by two texels per triangle, whose bilinear interpolation
-inside the triangle is the linear one of its corners.
+Textures become tiles of a grid, multiplied by the mean vertex color of their part: colors that vary within a textured
+part are lost. Parts without texture get two by two texels per triangle, whose bilinear interpolation inside the
+triangle is the linear one of its corners.
 """
 
 import math
@@ -27,10 +28,9 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
         model: parts with materials.
         texture_size: largest side of the texture; a single texture keeps its own size below that.
     """
-    textured = [part for part in model.parts if part.texture is not None]
-    plain = [part for part in model.parts if part.texture is None]
+    textured = [part for part in model.parts if _has_tile(part)]
     columns = max(1, math.ceil(math.sqrt(len(textured))))
-    blocks = sum(len(part.faces) for part in plain)
+    blocks = sum(len(part.faces) for part in model.parts if not _has_tile(part))
     rows = math.ceil(len(textured) / columns)
     largest = max((max(part.texture.shape[:2]) for part in textured if part.texture is not None), default=1)
     tile = min(texture_size // columns, max(largest, 16) + 2 * GUTTER) if textured else 0
@@ -41,7 +41,7 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
     pieces, starts = {}, np.cumsum([0, *(len(part.vertices) for part in model.parts)])
     number, block = 0, 0
     for index, part in enumerate(model.parts):
-        if part.texture is not None and part.uvs is not None:
+        if _has_tile(part):
             corner = np.array([number % columns, number // columns]) * tile
             pieces[index] = _textured(part, picture, corner, tile)
             number += 1
@@ -68,18 +68,28 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
     return mesh, order
 
 
+def _has_tile(part: ModelPart) -> bool:
+    return part.texture is not None and part.uvs is not None
+
+
 Piece = tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, "triangles 3"], Float[np.ndarray, "vertices 2"]]
 
 
 def _textured(part: ModelPart, picture: UInt8[np.ndarray, "h w 3"], corner: Int[np.ndarray, " 2"], tile: int) -> Piece:
-    """Draw the texture of a part into its tile; return vertices, triangles and texels of the vertices."""
+    """Draw the texture of a part into its tile; return vertices, triangles and texels of the vertices.
+
+    The mean of the vertex colors multiplies the texture.
+    """
     assert part.texture is not None and part.uvs is not None  # the caller has looked
     uvs = part.uvs[part.faces]  # f 3 2
     cell = np.floor(uvs.min(1) + 1e-6)
     local = uvs - cell[:, None]
     repeats = int(np.clip(np.ceil(local.max() - 1e-3), 1, MOST_REPEATS))
     inner = tile - 2 * GUTTER
-    pixels = to_srgb(to_linear(part.texture[..., :3] / 255) * np.array(part.factor))
+    factor = np.array(part.factor)
+    if part.colors is not None:
+        factor = factor * part.colors[part.faces].mean((0, 1))
+    pixels = to_srgb(to_linear(part.texture[..., :3] / 255) * factor)
     small = np.array(
         Image.fromarray((255 * pixels).round().astype(np.uint8)).resize(
             (max(1, inner // repeats),) * 2, Image.Resampling.BOX

@@ -3,6 +3,7 @@
 import math
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pygltflib
@@ -304,7 +305,40 @@ def test_a_file_without_a_mesh_is_refused() -> None:
 
 def test_a_file_of_another_form_is_refused() -> None:
     with pytest.raises(BadInput, match="not an animated asset"):
-        AnimatedGlb(GltfDocument({}).to_bytes())
+        AnimatedGlb(of_nodes([{"mesh": 7}]))
+
+
+def of_nodes(nodes: list[dict[str, Any]]) -> bytes:
+    """Return a GLB of a triangle and nodes, of which the first one is the root."""
+    document = GltfDocument({})
+    document.tree["nodes"] = nodes
+    positions = document.add_accessor("p", np.eye(3, dtype="<f4"), 34962)
+    document.add("meshes", name="m", primitives=[{"attributes": {"POSITION": positions}}])
+    document.tree["scene"] = document.add("scenes", name="s", nodes=[0])
+    return document.to_bytes()
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [{"mesh": 0, "children": [0]}],
+        [{"mesh": 0, "children": [1]}, {"children": [0]}],
+        [{"children": [number + 1]} for number in range(5000)] + [{"mesh": 0}],
+    ],
+    ids=["own child", "circle of two", "deep"],
+)
+def test_nodes_without_an_end_are_refused(nodes: list[dict[str, Any]]) -> None:
+    with pytest.raises(BadInput, match="circle or are nested too deeply"):
+        AnimatedGlb(of_nodes(nodes))
+
+
+def test_an_animated_circle_outside_of_the_scene_is_refused() -> None:
+    body = tracked()
+    nodes = body.file.tree["nodes"]
+    body.animation["channels"][0]["target"]["node"] = len(nodes)
+    nodes.append({"children": [len(nodes)]})
+    with pytest.raises(BadInput, match="not an animated asset"):
+        compose_glb([actor("odd", body)])
 
 
 def test_equal_scenes_give_equal_bytes() -> None:

@@ -280,6 +280,9 @@ def test_broken_files_get_a_sentence(case):
         read_foreign_glb(edited(box_glb(), edit), MOST)
 
 
-def test_too_many_triangles_are_refused_with_the_setting():
-    with pytest.raises(BadInput, match=r"12 triangles; asset\.max_faces allows 11.*asset\.max_faces=12"):
-        read_foreign_glb(box_glb(), 11)
+@pytest.mark.parametrize(("mode", "faces"), [(4, 12), (5, 34), (6, 34)], ids=["triangles", "strip", "fan"])
+def test_too_many_triangles_are_refused_with_the_setting(mode: int, faces: int):
+    content = edited(box_glb(), lambda tree: tree["meshes"][0]["primitives"][0].update(mode=mode))
+    assert len(read_foreign_glb(content, faces).model.faces) == faces
+    with pytest.raises(BadInput, match=rf"{faces} triangles; asset\.max_faces allows {faces - 1}.*max_faces={faces}"):
+        read_foreign_glb(content, faces - 1)

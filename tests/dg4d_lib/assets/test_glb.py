@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -300,6 +301,13 @@ def swapped(content: bytes, old: bytes, new: bytes) -> bytes:
 def test_a_file_of_another_form_is_refused(content: bytes, says: str) -> None:
     with pytest.raises(BadInput, match=says):
         read_glb(content)
+
+
+@pytest.mark.parametrize("read", [read_glb, read_mesh_glb])
+def test_a_node_that_is_its_own_child_is_refused(read: Callable[[bytes], object]) -> None:
+    content = swapped(WRITTEN["tracked"](), b'"name":"subject","mesh":0}', b'"children":[0],  "mesh":0}')
+    with pytest.raises(BadInput, match="circle"):
+        read(content)
 
 
 def test_a_transform_on_the_mesh_is_not_overlooked() -> None:

@@ -290,6 +290,18 @@ def test_components_reproduce_a_motion_that_they_span(settings: GltfSettings) ->
     assert len(content) < len(write_glb(asset, settings.model_copy(update={"components": 0}))) / 2
 
 
+@pytest.mark.parametrize("moving_normals", [True, False])
+def test_components_may_be_larger_than_any_displacement(moving_normals: bool) -> None:
+    """Half of the triangles move at once, the others in the last frame: the first component is larger than both."""
+    mesh = ball()
+    early = (mesh.vertices[mesh.faces].mean(1)[:, 1] > 0).repeat_interleave(3)
+    offsets = torch.zeros(16, len(mesh.vertices), 3)
+    offsets[1:, early, 0] = offsets[15:, ~early, 0] = 2.0
+    asset = Asset4D(mesh, offsets, FPS)
+    back = read_glb(write_glb(asset, GltfSettings(components=2, moving_normals=moving_normals)))
+    torch.testing.assert_close(placed(back), placed(asset), atol=1e-3, rtol=0)
+
+
 def test_trimesh_places_quantized_vertices_and_their_texture() -> None:
     scene = trimesh.load(io.BytesIO(write_glb(turning_ball(), GltfSettings(image="png"))), file_type="glb")
     (seen,) = scene.dump()

@@ -71,6 +71,13 @@ def test_a_cut_off_container_is_refused(keep: int) -> None:
         GlbReader(GltfDocument({}).to_bytes()[:keep])
 
 
+def test_endlessly_nested_json_is_refused() -> None:
+    text = b"[" * 100_000
+    content = b"glTF" + struct.pack("<II", 2, 28 + len(text)) + struct.pack("<I4s", len(text), b"JSON") + text
+    with pytest.raises(BadInput, match="corrupt"):
+        GlbReader(content + struct.pack("<I4s", 0, b"BIN\0"))
+
+
 def test_numbers_that_are_not_finite_never_reach_the_json() -> None:
     with pytest.raises(ValueError, match="JSON"):
         GltfDocument({"loss": float("nan")}).to_bytes()

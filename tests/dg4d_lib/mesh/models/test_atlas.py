@@ -6,7 +6,7 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.models.atlas import merge_parts
-from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.model import Model, ModelPart, to_srgb
 from dg4d_lib.mesh.render import render_mesh
 
 SQUARE = np.array([(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
@@ -48,6 +48,20 @@ def test_colors_of_vertices_are_interpolated():
     texels = (mesh.uvs * torch.tensor(mesh.texture.shape[1::-1])).long()
     found = mesh.texture[texels[:, 1], texels[:, 0]].numpy()
     np.testing.assert_allclose(found[[0, 3, 1, 4]], ours, atol=1 / 255)
+
+
+@pytest.mark.parametrize("levels", [(0.5, 0.5, 0.5, 0.5), (0.2, 0.3, 0.8, 0.7)], ids=["uniform", "mean of corners"])
+def test_vertex_colors_multiply_a_texture(levels: tuple[float, ...]):
+    uvs, colors = np.array([(0, 1), (1, 1), (1, 0), (0, 0)], float), np.array(levels)[:, None] * (1.0, 0.5, 1.0)
+    model = Model((ModelPart("a", SQUARE, FACES, uvs, CHECKER, (0.5, 1.0, 1.0), colors),))
+    half_of_half = to_srgb(np.array(0.25))
+    np.testing.assert_allclose(pixel(model, 0.4, 0.4), (half_of_half, 0, 0), atol=0.02)
+    np.testing.assert_allclose(pixel(model, 0.6, 0.6), (0, half_of_half, 0), atol=0.02)
+
+
+def test_a_texture_without_coordinates_is_not_used():
+    model = Model((ModelPart("a", SQUARE, FACES, None, CHECKER, (1.0, 0.0, 0.0)),))
+    np.testing.assert_allclose(pixel(model, 0.5, 0.5), (1, 0, 0), atol=0.02)
 
 
 def test_parts_keep_their_own_colors():
