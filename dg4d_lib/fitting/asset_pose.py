@@ -32,7 +32,6 @@ KEPT = 3  # candidates that are refined
 APART = 60  # degrees between the azimuths of placements that count as different
 ITERATIONS = 40
 REACH = 0.6  # world units: half diagonal of a model without a picture
-BATCH = 8  # renders at once
 STANDS = 0.08  # advantage of a model as it stands: its depth is right, too, which outlines hardly show
 UPRIGHT = {"y": (1.0, 0.0, 0.0, 0.0), "z": (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0), "-y": (0.0, 1.0, 0.0, 0.0)}
 
@@ -195,18 +194,11 @@ def picture_of_both(
 def _renders(
     cloud: Gaussians, placements: Sequence[Placement], rasterize: Rasterizer, size: int
 ) -> list[tuple[Float[Tensor, "s s 3"], Float[Tensor, "s s 1"]]]:
+    """Return color over white and alpha of every placement; opacities follow its scale, so none share a batch."""
     camera = OrbitCamera(width=size, height=size)
-    found = []
-    for start in range(0, len(placements), BATCH):
-        placed = [one.apply(cloud) for one in placements[start : start + BATCH]]
-        states = replace(
-            antialiased(placed[0], camera),
-            **{name: torch.stack([getattr(one, name) for one in placed]) for name in ("means", "log_scales", "quats")},
-        )
-        with torch.no_grad():
-            drawn = rasterize(states, [camera] * len(placed), torch.tensor(WHITE))
-        found += list(zip(drawn.color, drawn.alpha, strict=True))
-    return found
+    with torch.no_grad():
+        drawn = [rasterize(antialiased(one.apply(cloud), camera), [camera], torch.tensor(WHITE)) for one in placements]
+    return [(one.color[0], one.alpha[0]) for one in drawn]
 
 
 def _framed(

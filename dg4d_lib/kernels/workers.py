@@ -48,14 +48,15 @@ def torch_on_one_thread() -> Iterator[None]:
 def run_parallel(jobs: Sequence[Callable[[], object]]) -> None:
     """Run independent jobs on this thread and the pool, wait for all, and re-raise the exception of a failed one."""
     queue = iter(jobs)  # shared by the threads without a lock: advancing a list iterator is atomic under the GIL
+    count = torch.get_num_threads()
 
     def work() -> None:
         for job in queue:
             job()
 
     def help_out() -> None:
-        if _kept_count:
-            torch.set_num_threads(1)  # every thread has its own number
+        if torch.get_num_threads() != count:  # every thread has its own number and keeps it for later calls
+            torch.set_num_threads(count)
         work()
 
     helpers = min(thread_count(), len(jobs)) - 1

@@ -20,6 +20,7 @@ configure_numba()
 FOLD_DEG = 120.0  # between the normals of neighboring faces: the surface turns back on itself
 CREASE_DEG = 60.0  # between the normals of neighboring faces: a hard edge, seldom meant on creatures
 LONGEST_CELLS = 256  # cells of the search grid along the longest side of the mesh
+LARGE = 64  # mean sizes of a face: larger ones, such as a ground plane, are compared with all and not put into the grid
 
 
 @dataclass(frozen=True)
@@ -222,13 +223,20 @@ def _crossing(
 ) -> Bool[np.ndarray, " f"]:
     """Mark faces that cross a searched one, or are searched and cross any, by a grid of cells."""
     marked = np.zeros(len(faces), np.bool_)
+    points, corners = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    sizes = (high - low).max(1)
+    large = sizes > LARGE * sizes.mean()
+    if large.any():
+        rest = ~large
+        marked[rest] = _crossing(vertices, faces[rest], low[rest], high[rest], searched[rest])
+        _cross_large(points, corners, low, high, np.flatnonzero(large), searched, marked)
+        return marked
     extent = float((high.max(0) - low.min(0)).max())
     cell = max(2 * float((high - low).mean()), extent / LONGEST_CELLS, 1e-300)
     first = ((low - low.min(0)) / cell).astype(np.int64)
     last = ((high - low.min(0)) / cell).astype(np.int64)
     shape = last.max(0) + 1
     starts, members = _fill_grid(first, last, shape, searched)
-    points, corners = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     _cross_faces(points, corners, low, high, low.min(0), cell, shape, starts, members, searched, marked)
     return marked
 
@@ -308,12 +316,7 @@ def _cross_faces(points, faces, low, high, origin, size, shape, starts, members,
         for m in range(starts[cell], starts[cell + 1]):
             for n in range(starts[cell], m):
                 i, j = members[m], members[n]
-                if (marked[i] and marked[j]) or not (searched[i] or searched[j]):
-                    continue
-                apart = False
-                for axis in range(3):
-                    apart |= low[i, axis] > high[j, axis] or low[j, axis] > high[i, axis]
-                if apart:
+                if (marked[i] and marked[j]) or not (searched[i] or searched[j]) or _apart(low, high, i, j):
                     continue
                 here = (
                     int((max(low[i, 0], low[j, 0]) - origin[0]) / size) == x
@@ -322,6 +325,28 @@ def _cross_faces(points, faces, low, high, origin, size, shape, starts, members,
                 )
                 if here and _faces_cross(points, faces[i], faces[j]):
                     marked[i] = marked[j] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cross_large(points, faces, low, high, large, searched, marked):
+    """Mark the large faces that cross another one, and those that they cross, pairs with a searched face."""
+    for i in large:
+        for j in range(len(faces)):
+            if i == j or (marked[i] and marked[j]) or not (searched[i] or searched[j]) or _apart(low, high, i, j):
+                continue
+            if _faces_cross(points, faces[i], faces[j]):
+                marked[i] = marked[j] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _apart(low, high, i, j):
+    """Tell whether the bounding boxes of two faces have no place in common."""
+    apart = False
+    for axis in range(3):
+        apart |= low[i, axis] > high[j, axis] or low[j, axis] > high[i, axis]
+    return apart
 
 
 @njit(cache=True, nogil=True)

@@ -28,6 +28,15 @@ def edge_keys(edges: Int[np.ndarray, "e 2"]) -> Int64[np.ndarray, " e"]:
     return wide.min(1) * (wide.max(initial=0) + 1) + wide.max(1)
 
 
+def twin_half_edges(edges: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, "p 2"]:
+    """Return pairs of half edges that meet: the only two between two vertices, in opposite directions."""
+    keys = edge_keys(edges)
+    order = np.argsort(keys, kind="stable")
+    _, firsts, uses = np.unique(keys[order], return_index=True, return_counts=True)
+    pairs = np.stack([order[firsts[uses == 2]], order[firsts[uses == 2] + 1]], 1)
+    return pairs[edges[pairs[:, 0], 0] == edges[pairs[:, 1], 1]]
+
+
 def edge_graph(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     """Return the adjacency of the vertices: 1 where two share an edge."""
     edges = mesh_edges(faces)

@@ -66,7 +66,7 @@ def project(means, quats, scales, log_opacities, sh0, camera, height, width, rec
             scaled = _scale_columns(axes, state[7, k], state[8, k], state[9, k])
             half = _half(_world_jacobian(_projection_jacobian(x, y, z, focal, limit_x, limit_y), rotation), scaled)
             xx, xy, yy, determinant = _covariance(half)
-            a, b, c = _whitening(xx, xy, yy, determinant)
+            a, b, c = _whitening(xy, yy, determinant)
             reach = record[LOG_OPACITY, k] - _MIN_LOG_ALPHA
             squared_radius = max(reach, _ZERO) * _TWO * _LN_2
             extent_x, extent_y = np.sqrt(squared_radius * xx), np.sqrt(squared_radius * yy)
@@ -121,8 +121,8 @@ def unproject(
             projection = _projection_jacobian(x, y, z, focal, limit_x, limit_y)
             jacobian = _world_jacobian(projection, rotation)
             half = _half(jacobian, scaled)
-            xx, xy, yy, determinant = _covariance(half)
-            whitening = _whitening(xx, xy, yy, determinant)
+            _, xy, yy, determinant = _covariance(half)
+            whitening = _whitening(xy, yy, determinant)
             d_mean2d_x, d_mean2d_y = _mean2d_gradient(whitening, grad_record[MOMENT_U, k], grad_record[MOMENT_V, k])
             whitened = _whitened(half, whitening, yy)
             d_whitened = _whitened_gradient(
@@ -293,7 +293,7 @@ def _minors(half):
 
 @njit(**INLINE)
 @no_type_check
-def _whitening(xx, xy, yy, determinant):
+def _whitening(xy, yy, determinant):
     """Return W = [[a, b], [0, c]] of a covariance."""
     half_log2_e = _HALF * _LOG2_E
     a = np.sqrt(half_log2_e * yy / determinant)

@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.render import render_surface
-from dg4d_lib.inflation.surface import resample
+from dg4d_lib.inflation.surface import InflatedSurface, resample
 from dg4d_lib.visual_hull.carve import hull
 from dg4d_lib.visual_hull.known import KnownView
-from dg4d_lib.visual_hull.surface import blend, colored_surface, extract, observations
+from dg4d_lib.visual_hull.surface import blend, extract, observations
 
 SIZE = 96  # pixels at which silhouettes are compared
 CELLS = 64
@@ -46,7 +47,7 @@ def agreement(views: Sequence[KnownView]) -> Agreement:
     With two views, the other one is odd if the hull leaves out too much.
     """
     small = [smaller(view) for view in views]
-    filled = tuple(_filled(small, small))
+    filled = tuple(filled_shares(small, small).tolist())
     whole = Agreement(filled)
     if len(views) == 2:
         return replace(whole, odd=1 if whole.mean < LEAST else None)
@@ -54,7 +55,7 @@ def agreement(views: Sequence[KnownView]) -> Agreement:
     for index in range(1, len(small)):
         others = small[:index] + small[index + 1 :]
         kept = [share for i, share in enumerate(filled) if i != index]
-        gains[index] = _mean(_filled(others, others)) - _mean(kept)
+        gains[index] = float(filled_shares(others, others).mean()) - sum(kept) / len(kept)
     worst = max(gains, key=lambda index: gains[index])
     return replace(whole, odd=worst if gains[worst] > GAIN else None)
 
@@ -74,7 +75,7 @@ def turntable_score(views: Sequence[KnownView]) -> float:
     colors, weights = observations(vertices, faces, small, volume.step)
     blended, total = blend(vertices, colors, weights)
     difference = ((colors - blended).abs().mean(-1) * weights).sum() / weights.sum().clamp(min=1e-6)
-    filled = _mean(_filled(small, small))
+    filled = float(filled_shares(small, small).mean())
     return filled - COLOR_WEIGHT * float(difference) if bool(total.any()) else 0.0
 
 
@@ -83,22 +84,22 @@ def smaller(view: KnownView, size: int = SIZE) -> KnownView:
     return replace(view, cutout=resample(view.cutout, size), camera=replace(view.camera, width=size, height=size))
 
 
-def hull_alpha(views: Sequence[KnownView]) -> Float[Tensor, "k h w 1"]:
-    """Return the silhouettes of the hull of views, from their cameras."""
-    surface = colored_surface(hull(views, CELLS, SHARP), views[:1])
-    _, alpha = render_surface(surface, [view.camera for view in views])
-    return alpha
+def hull_alpha(views: Sequence[KnownView], cameras: Sequence[OrbitCamera] | None = None) -> Float[Tensor, "k h w 1"]:
+    """Return the silhouettes of the hull of views, from k cameras of one size; None: those of the views.
+
+    Raises:
+        BadInput: no place is inside of all silhouettes of the views.
+    """
+    vertices, faces = extract(hull(views, CELLS, SHARP))
+    surface = InflatedSurface(vertices, faces, torch.zeros_like(vertices), torch.zeros(len(vertices), dtype=torch.bool))
+    return render_surface(surface, [view.camera for view in views] if cameras is None else cameras)[1]
 
 
-def _filled(carving: Sequence[KnownView], views: Sequence[KnownView]) -> list[float]:
+def filled_shares(carving: Sequence[KnownView], views: Sequence[KnownView]) -> Float[Tensor, " k"]:
+    """Return the share of the silhouette of each of k views that the hull of some views fills; 0 without a hull."""
     try:
-        alpha = hull_alpha(carving)
+        alpha = hull_alpha(carving, [view.camera for view in views])
     except BadInput:
-        return [0.0] * len(views)
+        return torch.zeros(len(views))
     given = torch.stack([view.cutout[..., 3:] for view in views]) > 0.5
-    both = ((alpha > 0.5) & given).sum((1, 2, 3))
-    return [float(share) for share in both / given.sum((1, 2, 3)).clamp(min=1)]
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / max(1, len(values))
+    return ((alpha > 0.5) & given).sum((1, 2, 3)) / given.sum((1, 2, 3)).clamp(min=1)

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.visual_hull.adjusting import match_scale, scaling_between
-from dg4d_lib.visual_hull.agreement import hull_alpha, smaller, turntable_score
+from dg4d_lib.visual_hull.agreement import filled_shares, hull_alpha, smaller, turntable_score
 from dg4d_lib.visual_hull.carve import hull
-from dg4d_lib.visual_hull.known import KnownView, known_view
+from dg4d_lib.visual_hull.known import KnownView
 from dg4d_lib.visual_hull.surface import extract, observations
 
 CELLS = 64
@@ -108,49 +108,40 @@ def _matched(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
 def _scaled_to_hull(view: KnownView, others: Sequence[KnownView]) -> Float[Tensor, "s s 4"]:
     """Return the picture of a view with the bounding box that the hull of others has from its camera."""
     size = others[0].camera.width
-    expected = hull_alpha([*others, known_view(torch.ones(size, size, 4), *_angles(view))])[-1]
+    (expected,) = hull_alpha(others, [replace(view.camera, width=size, height=size)])
     if not bool((expected > 0.5).any()):
         return view.cutout
     reference = expected.expand(-1, -1, 4)
     return scaling_between(view.cutout, reference).apply(view.cutout, 0, size)
 
 
-def _angles(view: KnownView) -> tuple[float, float]:
-    return view.camera.azimuth_deg, view.camera.elevation_deg
-
-
 def _outline_errors(views: Sequence[KnownView]) -> tuple[list[float], list[float]]:
     """Return per view the share of its silhouette outside of the others' hull, and that which it cuts of theirs."""
-    masks = torch.stack([view.cutout[..., 3] for view in views]) > 0.5
-    areas = masks.sum((1, 2)).clamp(min=1)
-    whole = _filled(views, views, masks, areas)
+    whole = _filled(views, views)
     outside, damage = [], []
     for index in range(len(views)):
         others = [*views[:index], *views[index + 1 :]]
-        alone = _filled(others, views, masks, areas)
+        alone = _filled(others, views)
         kept = torch.arange(len(views)) != index
         outside.append(1 - float(alone[index]))
         damage.append(float((alone - whole)[kept].mean()))
     return outside, damage
 
 
-def _filled(
-    carving: Sequence[KnownView], views: Sequence[KnownView], masks: Tensor, areas: Tensor
-) -> Float[Tensor, " k"]:
-    """Return the share of every silhouette that the hull of some views fills."""
-    try:
-        blank = [replace(view, cutout=torch.ones_like(view.cutout)) for view in views]
-        alpha = hull_alpha([*carving, *blank])[len(carving) :, ..., 0]
-    except BadInput:
-        return torch.zeros(len(views))
-    return ((alpha > 0.5) & masks).sum((1, 2)) / areas
+def _filled(carving: Sequence[KnownView], views: Sequence[KnownView]) -> Float[Tensor, " k"]:
+    """Return the share of every silhouette that the hull of some views fills.
+
+    Blank views raise their number above `carve.MANY`, so that thin parts are widened: else true views of thin legs
+    seem to contradict each other.
+    """
+    blank = [replace(view, cutout=torch.ones_like(view.cutout)) for view in views]
+    return filled_shares([*carving, *blank], views)
 
 
 def _agreement(views: Sequence[KnownView]) -> float:
     """Return the mean share of the silhouettes that the hull of all fills."""
     small = [smaller(view) for view in views]
-    masks = torch.stack([view.cutout[..., 3] for view in small]) > 0.5
-    return float(_filled(small, small, masks, masks.sum((1, 2)).clamp(min=1)).mean())
+    return float(_filled(small, small).mean())
 
 
 def _color_errors(views: Sequence[KnownView]) -> list[float]:

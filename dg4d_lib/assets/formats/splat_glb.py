@@ -6,12 +6,12 @@ Viewers without the extension show colored points. World axes and units equal th
 from typing import Literal
 
 import torch
-from jaxtyping import Float
 
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import check_storable
+from dg4d_lib.mesh.models.model import to_linear
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0  # primitive mode
@@ -38,7 +38,8 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
         raise BadInput("a splat GLB needs at least one Gaussian; given none")
     scales = gaussians.scales if version == "ratified" else gaussians.log_scales
     quats = torch.nn.functional.normalize(gaussians.quats, dim=-1).roll(-1, -1)  # xyzw
-    rgba = torch.cat([_srgb_to_linear(gaussians.colors), gaussians.opacities[:, None]], 1)
+    linear = torch.from_numpy(to_linear(gaussians.colors.detach().cpu().numpy()))  # as glTF prescribes
+    rgba = torch.cat([linear, gaussians.opacities[:, None].detach().cpu()], 1)
     columns = {
         "POSITION": gaussians.means,
         "COLOR_0": rgba,
@@ -58,8 +59,3 @@ def write_splat_glb(gaussians: Gaussians, version: SplatGlbVersion = "ratified")
     node = document.add("nodes", name="splats", mesh=mesh)
     document.tree["scene"] = document.add("scenes", name="asset", nodes=[node])
     return document.to_bytes()
-
-
-def _srgb_to_linear(colors: Float[torch.Tensor, "n 3"]) -> Float[torch.Tensor, "n 3"]:
-    """Convert sRGB to linear light, which glTF prescribes for vertex colors."""
-    return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

@@ -225,13 +225,34 @@ def _lengths(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "e 2"]) ->
 def _bridges(points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], parts: int) -> Int[np.ndarray, "e 2"]:
     """Return edges from every component but the largest to the nearest points of others."""
     sizes = np.bincount(labels, minlength=parts)
+    order = np.argsort(sizes)
+    nearest, distances = _nearest_elsewhere(points, labels, np.flatnonzero(labels != order[-1]))
+    members = np.split(np.argsort(labels, kind="stable"), np.cumsum(sizes)[:-1])
     found = []
-    for part in np.argsort(sizes)[:-1]:
-        inside, outside = np.flatnonzero(labels == part), np.flatnonzero(labels != part)
-        distances, index = map(np.asarray, cKDTree(points[outside]).query(points[inside]))
-        others = labels[outside[index]]
-        for other in np.unique(others[distances <= TOUCHING * distances.min() + 1e-6]):
+    for part in order[:-1]:
+        inside = members[part]
+        gaps, others = distances[inside], labels[nearest[inside]]
+        for other in np.unique(others[gaps <= TOUCHING * gaps.min() + 1e-6]):
             rows = np.flatnonzero(others == other)
-            rows = rows[distances[rows].argsort(kind="stable")[:BRIDGES]]
-            found.append(np.stack([inside[rows], outside[index[rows]]], 1))
+            rows = inside[rows[gaps[rows].argsort(kind="stable")[:BRIDGES]]]
+            found.append(np.stack([rows, nearest[rows]], 1))
     return np.concatenate(found)
+
+
+def _nearest_elsewhere(
+    points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], chosen: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, " v"]]:
+    """Return the nearest point with another label, and its distance, for chosen points; others have infinity.
+
+    Different labels differ in a bit, so two trees per bit are enough, whatever the number of labels.
+    """
+    nearest, distances = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    for bit in range(int(labels.max()).bit_length()):
+        ones = (labels >> bit & 1).astype(bool)
+        for outside in (np.flatnonzero(ones), np.flatnonzero(~ones)):
+            inside = chosen[ones[chosen] != ones[outside[0]]]
+            tree = cKDTree(points[outside], compact_nodes=False, balanced_tree=False)  # faster far from points
+            found, index = map(np.asarray, tree.query(points[inside]))
+            closer = found < distances[inside]
+            distances[inside[closer]], nearest[inside[closer]] = found[closer], outside[index[closer]]
+    return nearest, distances

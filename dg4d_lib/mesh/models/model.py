@@ -105,11 +105,11 @@ def sample_bilinear(texture: UInt8[np.ndarray, "h w c"], uvs: Float[np.ndarray, 
 
 
 def to_linear(srgb: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Decode sRGB."""
+    """Convert sRGB to linear values (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def to_srgb(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Encode sRGB, clipped to [0, 1]."""
+    """Convert linear values, clipped to [0, 1], to sRGB; inverse of `to_linear`."""
     clipped = linear.clip(0, 1)
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055)

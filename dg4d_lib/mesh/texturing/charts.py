@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dg4d_lib.mesh.neighbors import edge_keys, half_edges
+from dg4d_lib.mesh.neighbors import half_edges, twin_half_edges
 from dg4d_lib.mesh.texturing.flatten import flat_areas, flatten, overlapping
 
 DENSITIES = (0.72, 1.35)  # bounds of the linear texel density in a chart, relative to its mean
@@ -145,12 +145,7 @@ class _Surface:
         self.areas = np.linalg.norm(areas, axis=1)
         self.normals = areas / np.maximum(self.areas, np.finfo(float).tiny)[:, None]
         edges = half_edges(faces)
-        keys = edge_keys(edges)
-        order = np.argsort(keys, kind="stable")
-        _, firsts, uses = np.unique(keys[order], return_index=True, return_counts=True)
-        one, other = order[firsts[uses == 2]], order[firsts[uses == 2] + 1]
-        opposed = edges[one, 0] == edges[other, 1]
-        self.pairs = np.stack([one[opposed], other[opposed]], 1)  # half edges that meet, each once
+        self.pairs = twin_half_edges(edges)
         self.lengths = np.linalg.norm(np.diff(vertices[edges], axis=1)[:, 0], axis=1)  # of half edges
         across = np.full(3 * len(faces), -1)
         across[self.pairs] = self.pairs[:, ::-1] // 3

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
+from dg4d_lib.mesh.models.model import to_linear, to_srgb
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
 from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
@@ -27,8 +27,6 @@ ROUNDS = 10  # of the robust fit
 OUTLIER = 0.2  # residual of the logarithm from which a texel's weight falls (Huber)
 STIFF = 1e-3  # Tikhonov weight of the terms that are not constant
 MOST_GAIN = 2.0  # bounds of the correction: this, and its inverse
-
-Array = NDArray[np.float64]
 
 
 def delight(mesh: TexturedMesh) -> TexturedMesh:
@@ -50,7 +48,7 @@ def remove_shading(texture: Float[Tensor, "h w 3"], mesh: TexturedMesh) -> Float
         return texture
     linear = to_linear(texture.detach().cpu().double().numpy())
     gain = _gain(linear, texels)
-    return torch.from_numpy(to_srgb((linear * gain[..., None]).clip(0, 1))).to(texture)
+    return torch.from_numpy(to_srgb(linear * gain[..., None])).to(texture)
 
 
 def _smooth_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
@@ -89,13 +87,3 @@ def _harmonics(normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 9"]:
     """Evaluate the real spherical harmonics of degrees 0 to 2, up to their factors."""
     x, y, z = normals.T
     return np.stack([np.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)
-
-
-def to_linear(srgb: Array) -> Array:
-    """Convert sRGB to linear values (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(linear: Array) -> Array:
-    """Convert linear values to sRGB; inverse of `to_linear`."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)

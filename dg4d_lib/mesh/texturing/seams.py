@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from dg4d_lib.mesh.extraction.topology import join_seams
-from dg4d_lib.mesh.neighbors import edge_keys, half_edges
+from dg4d_lib.mesh.neighbors import half_edges, twin_half_edges
 
 SAMPLES = 2  # points on a seam per texel of its length
 REACH = 6  # texels around seams that are corrected
@@ -37,15 +37,10 @@ def seam_points(
         size: side of the texture, texels.
     """
     _, joined = join_seams(vertices.detach().cpu().numpy(), faces.cpu().numpy())
-    split, welded = half_edges(faces.cpu().numpy()), half_edges(joined).astype(np.int64)
-    keys = edge_keys(welded)
-    order = np.argsort(keys, kind="stable")
-    _, firsts, uses = np.unique(keys[order], return_index=True, return_counts=True)
-    one, other = order[firsts[uses == 2]], order[firsts[uses == 2] + 1]
-    opposed = (welded[one, 0] == welded[other, 1]) & (split[one, 0] != split[other, 1])
-    opposed |= (welded[one, 0] == welded[other, 1]) & (split[one, 1] != split[other, 0])
+    one, other = half_edges(faces.cpu().numpy())[twin_half_edges(half_edges(joined))].swapaxes(0, 1)  # edge, end
+    cut = (one != other[:, ::-1]).any(1)
     places = uvs.detach().cpu().double().numpy()
-    first, second = places[split[one[opposed]]], places[split[other[opposed]]][:, ::-1]  # edge, end, uv
+    first, second = places[one[cut]], places[other[cut]][:, ::-1]  # edge, end, uv
     lengths = np.maximum(*(np.linalg.norm(np.diff(side, axis=1)[:, 0], axis=1) for side in (first, second)))
     counts = np.maximum(1, np.ceil(SAMPLES * lengths * size)).astype(np.int64)
     edge = np.repeat(np.arange(len(counts)), counts)

@@ -70,7 +70,7 @@ def register_nonrigid(
         tree = cKDTree(targets)
         moved = vertices + offsets[frame]
         for stiffness in STIFFNESS:
-            step = smooth[stiffness].solve(_steps(_with_normals(moved, faces), targets, tree))
+            step = smooth[stiffness].solve(closest_steps(_with_normals(moved, faces), targets, tree))
             moved = moved + torch.from_numpy(step.astype(np.float32))
             iou = silhouette_iou(moved[None], faces, silhouettes[frame, None])[0]
             if iou > ious[frame]:
@@ -80,15 +80,22 @@ def register_nonrigid(
     return registered, ious
 
 
-def _steps(
-    points: Float[np.ndarray, "v 6"], targets: Float[np.ndarray, "w 6"], tree: cKDTree
-) -> Float[np.ndarray, "v 3"]:
-    """Return the step of every point to its nearest target, averaged with that to the targets it is nearest to."""
-    steps = targets[tree.query(points)[1], :3] - points[:, :3]
+def closest_steps(
+    points: Float[np.ndarray, "v c"], targets: Float[np.ndarray, "w c"], tree: cKDTree | None = None
+) -> Float[np.ndarray, "v d"]:
+    """Return the step of every point to its nearest target, averaged with that to the targets it is nearest to.
+
+    Args:
+        points: position and weighted normal, d = c / 2 numbers each.
+        targets: likewise.
+        tree: of the targets, if there is one already.
+    """
+    axes = points.shape[1] // 2
+    steps = targets[(tree or cKDTree(targets)).query(points)[1], :axes] - points[:, :axes]
     nearest = cKDTree(points).query(targets)[1]
     count = np.bincount(nearest, minlength=len(points))
     chosen = count > 0  # points that are nearest to some target
-    for axis in range(3):
+    for axis in range(axes):
         back = np.bincount(nearest, targets[:, axis], len(points))[chosen] / count[chosen] - points[chosen, axis]
         steps[chosen, axis] = 0.5 * (steps[chosen, axis] + back)
     return steps

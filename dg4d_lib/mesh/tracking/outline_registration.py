@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -29,6 +28,7 @@ from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.fairing import LowPass, bump_filter
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh.tracking.isosurface_projection import steps_to_isosurface
+from dg4d_lib.mesh.tracking.nonrigid_registration import closest_steps
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -181,7 +181,7 @@ def outline_steps(
     total = np.zeros((len(moved), 3))
     if len(target) == 0 or len(outline.points) == 0:
         return total, np.zeros(len(moved))
-    steps = _closest_steps(outline.points, target)
+    steps = closest_steps(outline.points, target)
     if detail is not None:
         normals = outline.points[:, 2:] / FACING
         steps = (steps * normals).sum(1, keepdims=True) * normals
@@ -250,15 +250,3 @@ def _outline_pull(
         total += weight[:, None] * step
         share += weight
     return share.clip(max=1), total / share.clip(1e-6)[:, None]
-
-
-def _closest_steps(points: Float[np.ndarray, "p 4"], targets: Float[np.ndarray, "q 4"]) -> Float[np.ndarray, "p 2"]:
-    """Return the way of every point to its nearest target, averaged with that to the targets it is nearest to."""
-    steps = targets[cKDTree(targets).query(points)[1], :2] - points[:, :2]
-    nearest = cKDTree(points).query(targets)[1]
-    count = np.bincount(nearest, minlength=len(points))
-    chosen = count > 0
-    for axis in range(2):
-        back = np.bincount(nearest, targets[:, axis], len(points))[chosen] / count[chosen] - points[chosen, axis]
-        steps[chosen, axis] = 0.5 * (steps[chosen, axis] + back)
-    return steps

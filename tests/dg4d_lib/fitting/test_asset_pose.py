@@ -1,11 +1,13 @@
 """Placements of a model in a picture."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 import trimesh
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.asset_pose import APART, centered_placement, distinct_placements, find_placement
+from dg4d_lib.fitting.asset_pose import APART, centered_placement, distinct_placements, find_placement, judge
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.models.model import Model, ModelPart
 from dg4d_lib.mesh.models.surface_cloud import cover_surface
@@ -49,3 +51,11 @@ def test_a_given_azimuth_is_the_only_one():
     cloud = slab()
     (only,) = distinct_placements(cloud, picture(cloud), RASTERIZE, AZIMUTH)
     assert only.azimuth_deg == AZIMUTH
+
+
+def test_the_score_of_a_placement_does_not_depend_on_those_beside_it():
+    cloud = slab()
+    subject, true = picture(cloud), centered_placement(cloud, AZIMUTH)
+    (alone,) = judge(cloud, [true], subject, RASTERIZE, 96)
+    beside = judge(cloud, [replace(true, scale=0.1 * true.scale), true], subject, RASTERIZE, 96)
+    assert beside[1].score == alone.score

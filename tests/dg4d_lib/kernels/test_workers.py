@@ -61,12 +61,15 @@ def test_memory_of_a_recycled_array_waits_for_the_tensor_made_of_it():
 def test_the_kernels_keep_their_threads_while_torch_has_one():
     before, seen = torch.get_num_threads(), []
     torch.set_num_threads(3)
+    started = threading.Barrier(3)
+    jobs = [lambda: seen.append((started.wait(10), torch.get_num_threads())[1])] * 3
     try:
         with torch_on_one_thread(), torch_on_one_thread():
-            started = threading.Barrier(3)
-            run_parallel([lambda: seen.append((started.wait(10), torch.get_num_threads())[1])] * 3)
+            run_parallel(jobs)
             assert thread_count() == 3
         assert seen == [1, 1, 1]  # at once, by the barrier
         assert torch.get_num_threads() == thread_count() == 3
+        run_parallel(jobs)
+        assert seen[3:] == [3, 3, 3]  # in the pool's threads, too
     finally:
         torch.set_num_threads(before)

@@ -3,9 +3,10 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.mesh.models.model import to_linear, to_srgb
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
-from dg4d_lib.mesh.texturing.delight import delight, to_linear, to_srgb
+from dg4d_lib.mesh.texturing.delight import delight
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 
 SIZE = 128

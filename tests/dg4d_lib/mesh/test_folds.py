@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.mesh import folds
 from dg4d_lib.mesh.extraction.silhouettes import cameras_of, silhouette_iou
 from dg4d_lib.mesh.extraction.unfold import unfold, without_new_defects
 from dg4d_lib.mesh.folds import DefectFinder, genus, self_intersecting, surface_defects
@@ -59,9 +60,11 @@ def test_two_spheres_cross_where_they_overlap(distance: float, crossing: bool) -
     assert (np.abs(middle - distance / 2) < 0.3).all()
 
 
-def test_crossings_are_those_of_a_search_over_all_pairs() -> None:
+@pytest.mark.parametrize("largest", [1, 1000])
+def test_crossings_are_those_of_a_search_over_all_pairs(largest: float) -> None:
     generator = np.random.default_rng(0)
     corners = generator.normal(size=(60, 1, 3)) + 0.5 * generator.normal(size=(60, 3, 3))
+    corners[::40] *= largest
     faces = np.arange(180).reshape(60, 3)
     expected = np.zeros(60, bool)
     for i in range(60):
@@ -69,6 +72,24 @@ def test_crossings_are_those_of_a_search_over_all_pairs() -> None:
             expected[[i, j]] |= i != j and any(passes(corners[i][[k, (k + 1) % 3]], corners[j]) for k in range(3))
     assert expected.any() and not expected.all()
     assert np.array_equal(self_intersecting(corners.reshape(-1, 3), faces), expected)
+
+
+def test_a_ground_plane_does_not_put_a_model_into_few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = sphere()
+    corners = [[-1000, -0.95, -1000], [1000, -0.95, -1000], [0, -0.95, 1000]]
+    fill, fullest = folds._fill_grid, []
+
+    def count(*grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        starts, members = fill(*grid)
+        fullest.append(np.diff(starts).max())
+        return starts, members
+
+    monkeypatch.setattr(folds, "_fill_grid", count)
+    plane = np.arange(3)[None] + len(vertices)
+    marked = self_intersecting(np.concatenate([vertices, corners]), np.concatenate([faces, plane]))
+    below = vertices[:, 1] < -0.95
+    assert np.array_equal(marked, [*(below[faces].any(1) & ~below[faces].all(1)), True])
+    assert max(fullest) < 100
 
 
 def passes(segment: np.ndarray, triangle: np.ndarray) -> bool:

@@ -2,7 +2,7 @@ import torch
 from creatures import creature, ring, seen
 
 from dg4d_lib.inflation.surface import InflatedSurface
-from dg4d_lib.visual_hull.agreement import agreement, turntable_score
+from dg4d_lib.visual_hull.agreement import agreement, hull_alpha, turntable_score
 from dg4d_lib.visual_hull.known import KnownView
 
 
@@ -31,3 +31,10 @@ def test_silhouettes_that_exclude_each_other_score_nothing():
     head, foot = front.cutout.clone(), side.cutout.clone()
     head[24:], foot[:72] = 0, 0
     assert turntable_score([KnownView(front.camera, head), KnownView(side.camera, foot)]) == 0
+
+
+def test_the_silhouette_of_a_hull_is_seen_from_any_camera():
+    between = seen(creature(), 30)
+    (alpha,) = hull_alpha(ring(6), [between.camera])
+    mask, truth = alpha > 0.5, between.cutout[..., 3:] > 0.5
+    assert float((mask & truth).sum() / (mask | truth).sum()) > 0.85

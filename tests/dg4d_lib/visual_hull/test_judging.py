@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import creatures
 import pytest
 import torch
 from torch import Tensor
@@ -81,3 +82,10 @@ def test_views_of_any_scale_get_that_of_the_input_also_from_above(ring: list[Kno
 
 def test_two_pictures_cannot_be_judged(ring: list[KnownView]) -> None:
     assert judge_views(ring[0], ring[4:5])[0].weight == 1
+
+
+def test_true_views_of_thin_legs_have_full_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    legs = [((x, -0.45, z), (0.018, 0.3, 0.018), (0.2, 0.6, 0.6)) for x in (-0.1, 0.12) for z in (-0.3, 0.25)]
+    monkeypatch.setattr(creatures, "PARTS", (*creatures.PARTS[:2], *legs))
+    views = creatures.ring(6)
+    assert min(one.outline for one in judge_views(views[0], views[1:])) > 0.85

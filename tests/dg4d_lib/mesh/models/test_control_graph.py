@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
+from dg4d_lib.mesh.models import control_graph
 from dg4d_lib.mesh.models.control_graph import build_control_graph, graph_of_points, point_graph, surface_graph
 
 
@@ -52,6 +54,23 @@ def test_separate_components_are_linked():
             a for a, b in graph.edges.tolist() if b in reached
         }
     assert len(reached) == len(graph.nodes)
+
+
+def test_every_piece_is_joined_to_its_nearest_neighbor_by_few_searches(monkeypatch):
+    searches = []
+    monkeypatch.setattr(control_graph, "cKDTree", lambda *args, **options: searches.append(args) or cKDTree(*args))
+    body, random = strip(40), np.random.default_rng(0)
+    pieces = np.arange(300).repeat(3)
+    vertices = random.normal(size=(300, 3))[pieces] + 0.02 * random.normal(size=(900, 3))
+    points, labels = np.concatenate([body[0], vertices]), np.concatenate([np.full(len(body[0]), -1), pieces])
+    faces = np.concatenate([body[1], np.arange(900).reshape(-1, 3) + len(body[0])])
+    graph = surface_graph(points, faces).toarray()
+    gaps = np.linalg.norm(points[:, None] - points, axis=-1) + np.where(labels[:, None] == labels, np.inf, 0)
+    for piece in range(300):
+        rows = np.flatnonzero(labels == piece)
+        row, column = np.unravel_index(gaps[rows].argmin(), gaps[rows].shape)
+        assert graph[rows[row], column] == pytest.approx(gaps[rows].min())
+    assert len(searches) < 60
 
 
 def test_scattered_points_get_a_graph():
