@@ -99,7 +99,7 @@ class WarpSettings(Settings):
 
 
 class SvdSettings(Settings):
-    """Driving video by Stable Video Diffusion; candidate k has the seed of the order plus k - 1."""
+    """Driving video by Stable Video Diffusion; candidate k uses the seed plus k - 1."""
 
     kind: Literal["svd"] = "svd"
     candidates: Candidates = 1
@@ -112,7 +112,7 @@ class SvdSettings(Settings):
 
 
 class DiffusersVideoSettings(Settings):
-    """Driving video by any image-to-video pipeline of diffusers; candidate k has the seed of the order plus k - 1."""
+    """Driving video by any image-to-video pipeline of diffusers; candidate k uses the seed plus k - 1."""
 
     kind: Literal["diffusers"] = "diffusers"
     candidates: Candidates = 1

@@ -85,7 +85,8 @@ def make(
     text: Annotated[
         str,
         typer.Option(
-            metavar="WORDS", help="a prompt instead of a picture; --set text.weights=NAME is the text-to-image model"
+            metavar="WORDS",
+            help="a prompt instead of a picture; text-to-image model: --set text.weights=FOLDER_OR_HUB_ID",
         ),
     ] = "",
     video: Annotated[
@@ -226,8 +227,21 @@ def motions(
         ]
         terminal.print_rows(console, [("pick", "score", "motion, best first"), *rows])
         console.print(f"sheet: {folder / 'motions.png'}", markup=False)
-        best = shlex.join(["dg4d", "make", str(picture), "--pick", str(ranking["candidates"][0]["number"])])
-        console.print(f"make the asset with one of them: {best}", markup=False)
+        options: dict[str, object] = {
+            "--profile": profile if profile != "preview" else "",
+            "--seed": seed or "",
+            "--mask": mask,
+            "--box": box,
+            "--depth": depth,
+            "--layers": layers,
+            "--pick": ranking["candidates"][0]["number"],
+        }
+        given = [*(("--set", change) for change in changes or ()), *options.items()]
+        words = [word for option, value in given if value for word in (option, str(value))]
+        flags = ["--commercial-only"] if commercial_only else []
+        end = ["--"] if str(picture).startswith("-") else []
+        best = shlex.join(["dg4d", "make", *words, *flags, *end, str(picture)])
+        console.print(f"make the asset with one of them: {best}", markup=False, soft_wrap=True)
 
 
 @app.command()
@@ -252,7 +266,9 @@ def batch(
     seed: Seed = 0,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=64, metavar="N", help="items converted at a time  [default: 1; 16 of a deployment]"),
+        typer.Option(
+            min=1, max=64, metavar="N", help="items converted at a time  [default: 1; 16 with --where deployment:POOL]"
+        ),
     ] = None,
     where: Annotated[
         str,

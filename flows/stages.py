@@ -165,7 +165,7 @@ def known_views(
 ) -> KnownViews | None:
     """Return views of other sides: the user's, else those that a model draws, else none."""
     if job.views is not None:
-        return tasks.prepare_views(job.views, source, subject, conversion)
+        return tasks.prepare_views(job.views, source, subject, conversion, job.mask)
     return tasks.generate_views(subject, conversion) if job.settings.views.kind != "none" else None
 
 

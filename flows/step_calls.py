@@ -98,7 +98,13 @@ def prepare_subject(
     return run_step("prepare_subject", Subject, **locals())
 
 
-def prepare_views(views: ArtifactRef, source: ArtifactRef, subject: Subject, conversion: Conversion) -> KnownViews:
+def prepare_views(
+    views: ArtifactRef,
+    source: ArtifactRef,
+    subject: Subject,
+    conversion: Conversion,
+    mask: ArtifactRef | None = None,
+) -> KnownViews:
     """Cut out pictures of other sides, bring them to the scale of the input and compare them with it."""
     return run_step("prepare_views", KnownViews, **locals())
 

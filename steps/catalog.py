@@ -102,7 +102,13 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "prepare_views",
-            inputs={"views": VIEWS, "source": SOURCE, "subject": PNG, "footage": _optional(FRAMES)},
+            inputs={
+                "views": VIEWS,
+                "source": SOURCE,
+                "mask": _optional(SOURCE),
+                "subject": PNG,
+                "footage": _optional(FRAMES),
+            },
             outputs={"known_views": BANK, "picture": PNG},
             sections=("subject",),
             timeout_s=2400,  # as prepare_subject

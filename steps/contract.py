@@ -163,10 +163,31 @@ def load_object(name: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def settings_errors(error: ValidationError) -> str:
-    """Return the wrong fields of settings with their values and the allowed ones, for a message."""
-    lines = [f"{'.'.join(map(str, e['loc']))} = {shown(e['input'])}: {e['msg']}" for e in error.errors()]
+def settings_errors(error: ValidationError, given: Any = None) -> str:
+    """Return the wrong fields of settings with their values and the allowed ones, for a message.
+
+    Args:
+        error: of pydantic.
+        given: settings that were validated, from which kinds are recognized.
+    """
+    lines = []
+    for each in error.errors():
+        name = _setting_name(each["loc"], given)  # empty if all settings together are refused
+        lines.append(f"{name} = {shown(each['input'])}: {each['msg']}" if name else each["msg"])
     return "; ".join(lines)
+
+
+def _setting_name(location: tuple[int | str, ...], given: Any) -> str:
+    """Return a dotted name without the kinds, which pydantic names in a location after the section that has them."""
+    names, kind = [], None
+    for part in location:
+        if part == kind:
+            kind = None
+            continue
+        names.append(str(part))
+        given = given.get(part) if isinstance(given, dict) else None
+        kind = given.get("kind") if isinstance(given, dict) else None
+    return ".".join(names)
 
 
 def shown(value: Any) -> str:

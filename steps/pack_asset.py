@@ -25,7 +25,13 @@ from dg4d_lib.assets.placement import Placement, Surface, place
 from dg4d_lib.assets.rendering.preview import write_mp4, write_preview, write_turntable
 from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
-from dg4d_lib.assets.resample import pose_gaussians_in_chunks, resample_asset, resampled_positions
+from dg4d_lib.assets.resample import (
+    MAX_STATES,
+    highest_rate,
+    pose_gaussians_in_chunks,
+    resample_asset,
+    resampled_positions,
+)
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -83,6 +89,13 @@ class PackageWriter:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+    def rate_notes(self) -> list[str]:
+        """Return a note if the files have another frame rate than the requested one."""
+        if self.fps == (self.pack.fps or self.video.fps):
+            return []
+        reason = "every frame has its own mesh" if isinstance(self.surface, list) else f"at most {MAX_STATES} states"
+        return [f"the files have {self.fps:.4g} frames per second instead of {self.pack.fps:g} (pack.fps): {reason}"]
 
     def write_meshes(self) -> None:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
@@ -203,7 +216,7 @@ def run(job: Job) -> StepReport:
     """
     with TemporaryDirectory() as scratch:
         package = _read_inputs(job, Path(scratch))
-        notes: list[str] = []
+        notes = package.rate_notes()
         writers: tuple[Callable[[], Sequence[str] | None], ...] = (  # the slowest first
             package.write_preview,
             package.write_rig,
@@ -260,14 +273,10 @@ def _read_inputs(job: Job, scratch: Path) -> PackageWriter:
     surface = _surface(job, video.fps, about.notes)
     mesh_frames = len(surface.offsets) if isinstance(surface, Asset4D) else len(surface)
     _check_frames(len(video), {"motion": frames, "mesh": mesh_frames})
-    fps = pack.fps or video.fps
+    fps = video.fps
     if isinstance(surface, Asset4D):
+        fps = min(pack.fps or fps, highest_rate(frames, fps))
         surface = resample_asset(surface, gaussians, deformation, frames, fps)
-    elif fps != video.fps:
-        raise BadInput(
-            f"a mesh per frame has the frames of the driving video, {video.fps:g} a second; {fps:g} are asked for: "
-            "leave pack.fps at 0, or choose mesh.mode=tracked"
-        )
     if pack.delight and "moving" not in job.inputs:  # a user's model keeps its textures
         surface = _delit(surface)
     placement = place(surface, pack.height_m, pack.ground)

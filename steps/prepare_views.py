@@ -1,6 +1,7 @@
 """Step that turns pictures of other sides, a turntable or known cameras into a bank of views beside the input."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,6 +21,7 @@ from steps.artifacts.media import read_frames, read_png, write_png
 from steps.runtime.job import Job, StepReport
 from steps.sources.bank_writer import write_bank
 from steps.sources.clips import evenly_spaced
+from steps.sources.masks import read_mask, scaled_box
 from steps.sources.networks import LoadedNetwork, open_network
 from steps.sources.placing import place_pictures
 from steps.sources.reader import Source, read_source
@@ -53,7 +55,7 @@ def run(job: Job) -> StepReport:
         given = read_views(folder / "views")
         job.progress(1, 3, {})
         network = open_network(settings.matting)
-        known = _Reader(folder / "views", settings, inputs, job.inputs["source"], network.segmenter)
+        known = _Reader(folder / "views", settings, inputs, job.inputs, network.segmenter)
         moments, notes = known.turntable(given) if given.turntable else known.views(given)
     job.progress(2, 3, {})
     first = [known_view(inputs[0], name=INPUT), *moments[0]]
@@ -80,9 +82,9 @@ class _Reader:
 
     Args:
         folder: with the files of `views.json`.
-        settings: of the input, which all pictures share.
+        settings: of the input, which all pictures share but for the box.
         inputs: frames of the input, cut out.
-        original: file of the input.
+        files: of the input: `source`, and `mask` if there is one.
         segmenter: network for opaque pictures.
 
     Attributes:
@@ -94,17 +96,12 @@ class _Reader:
         folder: Path,
         settings: SubjectSettings,
         inputs: Float[Tensor, "t s s 4"],
-        original: Path,
+        files: Mapping[str, Path],
         segmenter: Segmenter,
     ) -> None:
-        self.folder, self.inputs, self.original, self.segmenter = folder, inputs, original, segmenter
-        self.settings = settings.model_copy(update={"box": ()})  # the box is that of the input
+        self.folder, self.inputs, self.files, self.segmenter = folder, inputs, files, segmenter
+        self.settings, self.box = settings.model_copy(update={"box": ()}), settings.box
         self.used_network = False
-
-    def source(self) -> Source:
-        """Return the decoded input."""
-        most = max(2, len(self.inputs))
-        return read_source(self.original, self.folder, most, self.settings.max_decode_gb)
 
     def views(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
         """Return the views of pictures and of videos beside the input's."""
@@ -118,7 +115,7 @@ class _Reader:
         if any(moving):
             raise BadInput("--cameras names pictures and videos; give either pictures of one moment, or videos of all")
         if given.input_camera is not None:
-            placed = place_pictures(given, sources, self.source(), self.inputs[:1], self._cut_whole)
+            placed = self._placed(given, sources, self._source(), self.inputs[:1])
             return [[frames[0] for frames in placed]], ()
         cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
         return [self._scaled(given.views, [cutout[0] for cutout in cutouts])], tuple(
@@ -141,36 +138,56 @@ class _Reader:
 
     def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[Moments, tuple[str, ...]]:
         """Return the views of synchronized videos by frame."""
-        count = len(self.inputs)
+        own = self._source()
         for view, source in zip(given.views, sources, strict=True):
-            if len(source.frames) != count:
+            if source.count != own.count:
                 raise BadInput(
-                    f"{view.name} has {source.count} frames and the input {count}; synchronized videos must have "
+                    f"{view.name} has {source.count} frames and the input {own.count}; synchronized videos must have "
                     "equally many"
                 )
-        placed = place_pictures(given, sources, self.source(), self.inputs, self._cut_whole)
-        return [[view[frame] for view in placed] for frame in range(count)], ()
+        placed = self._placed(given, sources, own, self.inputs)
+        return [[view[frame] for view in placed] for frame in range(len(self.inputs))], ()
+
+    def _placed(
+        self, given: GivenViews, sources: Sequence[Source], own: Source, inputs: Float[Tensor, "t s s 4"]
+    ) -> list[list[KnownView]]:
+        """Return the views of known cameras by frame, with the input cut out as it was framed: by its mask and box."""
+        first, mask = replace(own, frames=own.frames[:1]), None
+        if "mask" in self.files:
+            mask = read_mask(self.files["mask"], own, self.folder, self._most, self.settings.max_decode_gb)[:1]
+        whole = self._cut_whole(first, inputs.shape[1], scaled_box(self.box, own), mask)
+        return place_pictures(given, sources, own, whole, inputs, self._cut_whole)
+
+    @property
+    def _most(self) -> int:
+        """Largest number of frames that are read of a video."""
+        return max(2, len(self.inputs))
+
+    def _source(self) -> Source:
+        """Return the decoded input."""
+        return read_source(self.files["source"], self.folder, self._most, self.settings.max_decode_gb)
 
     def _read(self, file: str, name: str, frames: int = 0) -> Source:
-        most = frames or max(2, len(self.inputs))
         try:
-            return read_source(self.folder / file, self.folder, most, self.settings.max_decode_gb)
+            return read_source(self.folder / file, self.folder, frames or self._most, self.settings.max_decode_gb)
         except BadInput as error:
             raise BadInput(f"{name}: {error}") from error
 
     def _cut(
-        self, source: Source, settings: SubjectSettings | None = None
+        self, source: Source, settings: SubjectSettings | None = None, mask: Float[Tensor, "t h w"] | None = None
     ) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
         """Cut out the subject, by default framed as the input; return notes, too."""
         settings = settings or self.settings
-        prepared = prepare_subject(source.frames, source.has_alpha, settings, segmenter=self.segmenter)
+        prepared = prepare_subject(source.frames, source.has_alpha, settings, mask, self.segmenter)
         self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
         return prepared.frames, prepared.notes
 
-    def _cut_whole(self, source: Source, size: int) -> Float[Tensor, "t s s 4"]:
+    def _cut_whole(
+        self, source: Source, size: int, box: tuple[int, ...] = (), mask: Float[Tensor, "t h w"] | None = None
+    ) -> Float[Tensor, "t s s 4"]:
         """Cut out the subject in the whole frame, without a crop."""
-        whole = SubjectSettings(size=min(LARGEST_WHOLE, size), framing="keep", matting=self.settings.matting)
-        return self._cut(source, whole)[0]
+        whole = SubjectSettings(size=min(LARGEST_WHOLE, size), framing="keep", matting=self.settings.matting, box=box)
+        return self._cut(source, whole, mask)[0]
 
     def _scaled(self, given: Sequence[GivenView], cutouts: Sequence[Float[Tensor, "s s 4"]]) -> list[KnownView]:
         """Return views in the scale of the input: as they are, or with its height, whichever agrees better."""

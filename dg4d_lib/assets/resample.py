@@ -16,6 +16,11 @@ MAX_STATES = 1000  # a GLB has a morph target per state, and weights of all of t
 STATES_AT_ONCE = 32  # bounds memory
 
 
+def highest_rate(frames: int, fps: float) -> float:
+    """Return the largest frame rate, per second, to which `resampled_positions` resamples these frames."""
+    return max(MAX_STATES, frames) * fps / frames
+
+
 def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
     """Return the positions of round(frames * wanted / fps) states of a loop at another frame rate.
 
@@ -36,7 +41,7 @@ def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor,
     if count > max(MAX_STATES, frames):
         raise BadInput(
             f"{wanted:g} frames per second give {count} states for this motion of {frames / fps:.3g} s, at most "
-            f"{MAX_STATES} are allowed; set pack.fps to at most {MAX_STATES * fps / frames:.4g}"
+            f"{MAX_STATES} are allowed; set pack.fps to at most {highest_rate(frames, fps):.4g}"
         )
     return torch.arange(count, dtype=torch.float64) * frames / count
 

@@ -4,6 +4,10 @@ Every iteration renders all frames twice: from the input view, where the target 
 that orbits at constant speed, where the target comes from a refiner. Colors are optimized as logits; the geometry is
 fixed.
 
+The loss on the orbit is a mean over all frames. Gradients of a texture that only one frame shows are thus inversely
+proportional to the number of frames, and so small that Adam's epsilon shortens the steps. Its epsilon is scaled alike,
+so that the steps are those of DG4D's public code, 14 frames with torch's default epsilon, for any number of frames.
+
 A tracked mesh may also get a residual texture per frame, which is added to the shared texture and optimized as color,
 not as logit. Rendering is linear in the colors, so both are sampled separately at their own resolutions and no frame
 needs a texture of full size.
@@ -30,6 +34,7 @@ from dg4d_lib.texture.refiner import Refiner
 from dg4d_lib.video.driving import DrivingVideo
 
 MARGIN = 1 / 512  # distance of colors from 0 and 1, whose logits are infinite
+ADAM_EPS, PUBLIC_FRAMES = 1e-8, 14  # torch's default epsilon, frames of DG4D's public code
 MAX_SLOPE = 1 / 4  # maximum derivative of the sigmoid; ratio of the residuals' learning rate to that of the logits
 
 
@@ -97,7 +102,12 @@ def refine_textures(
     starts = [texture.clamp(MARGIN, 1 - MARGIN).logit() for texture in textures]
     logits = [start.clone().requires_grad_() for start in starts]
     trained = [residual for residual in residuals if residual is not None]
-    groups = [{"params": logits, "lr": settings.lr}, {"params": trained, "lr": MAX_SLOPE * settings.lr}]
+    frame_eps = ADAM_EPS * PUBLIC_FRAMES / frames
+    shared_eps = ADAM_EPS if len(clips) == 1 else frame_eps  # all frames show the texture of a single clip
+    groups = [
+        {"params": logits, "lr": settings.lr, "eps": shared_eps},
+        {"params": trained, "lr": MAX_SLOPE * settings.lr, "eps": frame_eps},
+    ]
     adam = torch.optim.Adam(groups if trained else groups[:1])
     for iteration in range(settings.iterations):
         colors = [logit.sigmoid() for logit in logits]

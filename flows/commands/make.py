@@ -57,8 +57,6 @@ def make_each(wish: Wish, console: "Console") -> int:
         BadInput: arguments cannot be combined, or the only picture cannot be used.
         StepError: a step of the only picture failed.
     """
-    if wish.picked and wish.video:
-        raise BadInput("--pick chooses a generated motion and cannot be combined with --video")
     if len(wish.pictures) < 2:
         picture = wish.pictures[0] if wish.pictures else None
         named = picture or wish.asset or wish.video
@@ -87,9 +85,14 @@ def make_each(wish: Wish, console: "Console") -> int:
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
     """Make one asset, and print its files and how to see it."""
     request = wish.request(item, picture)
+    if wish.picked and request.has_motion:
+        raise BadInput(f"--pick chooses a generated motion, and {request.source_name} is a video; leave --pick out")
+    for sentence in request.unused():
+        console.print(f"note: {sentence}", markup=False)
     check_folder(folder, item, wish.force)
     job = request.to_job(home.store())
-    cached = is_current(folder, job.digest())
+    named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
+    cached = named == item and is_current(folder, job.digest())
     if not cached:
         _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
     if cached:

@@ -193,7 +193,7 @@ def watch(
 ) -> None:
     """Convert the files that are dropped into a folder.
 
-    Uses the deployment "Catalog to 4D", and runs until it is stopped.
+    Uses the deployment "Catalog to 4D" of `dg4d up`, and runs until it is stopped.
     """
     with exit_on_error():
         from flows.convert import connect
@@ -205,8 +205,9 @@ def watch(
         connect()
         from flows.serving.results import Results
         from flows.serving.roots import granted
-        from flows.serving.watching import Watcher, announce
+        from flows.serving.watching import Watcher, announce, check_registered
 
+        check_registered()
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
         watcher = Watcher(folder, out, rest_s, background.background_server().folder / f"watched-{name}")
         typer.echo(f"watching {watcher.folder}; packages go to {watcher.out}; stop with Ctrl-C")

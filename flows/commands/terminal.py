@@ -1,5 +1,7 @@
 """Progress of runs: live on a terminal, as lines in a log file."""
 
+import errno
+import os
 import shlex
 import sys
 import threading
@@ -42,7 +44,10 @@ def console(stderr: bool = False) -> Console:
 
 
 class _Terminal(Console):
-    """Console that escapes control characters in all printed text."""
+    """Console that escapes control characters in all printed text, and leaves a closed pipe to `exit_on_error`."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
     def print(self, *objects: Any, **options: Any) -> None:
         super().print(*(visible(one) if isinstance(one, str) else one for one in objects), **options)

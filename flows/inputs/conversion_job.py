@@ -14,9 +14,10 @@ from flows.inputs import models, naming, sources
 from flows.inputs.given_views import ViewsRequest
 from flows.inputs.signing_key import certificate_digest
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
-from steps.profiles import PipelineSettings
+from steps.profiles import PipelineSettings, profile
 from steps.runtime.installed_code import catalog, request_version
-from steps.runtime.weights import identities, license_of, open_weights, weights_in, without_paths
+from steps.runtime.weights import identities, license_of, require_weights, weights_in, without_paths
+from steps.sources.media_types import is_video
 from steps.store.artifact_store import ArtifactStore
 
 LONGEST_NAME = 60  # characters of a name made from a prompt
@@ -61,6 +62,20 @@ class ConversionRequest(Frozen):
         path = self._footage or self.asset
         return path.name if path else f'"{self.text}"'
 
+    @property
+    def has_motion(self) -> bool:
+        """True if the source is a video, whose motion is followed."""
+        return self._must_move or (self._footage is not None and is_video(self._footage))
+
+    def unused(self) -> list[str]:
+        """Return sentences about what is given without an effect."""
+        found = []
+        if self.picture is not None and self.video is not None:
+            found.append(f"{self.picture.name} only names the asset: the subject is that of {self.video.name}")
+        if self.has_motion and self.settings.driving != profile(self.profile).driving:
+            found.append(f"driving.* settings have no effect: the motion is that of {self.source_name}")
+        return found
+
     def check(self) -> None:
         """Validate the request before any work.
 
@@ -80,7 +95,7 @@ class ConversionRequest(Frozen):
         if self.mask is not None:
             sources.check_mask(self.mask)
         self._check_depth()
-        self.given_views.check()
+        self.given_views.check(self._footage)
         if self.given_views and self.text:
             raise BadInput("--view, --turntable and --cameras show the sides of a picture; --text has none to show")
         if self.bank is not None:
@@ -90,9 +105,13 @@ class ConversionRequest(Frozen):
             raise BadInput("prior.kind=oracle needs ground-truth views: --bank DIR")
         if not oracle and self.bank is not None:
             raise BadInput("only the oracle prior reads --bank: add --set prior.kind=oracle")
+        if self.settings.pack.fps and self.settings.mesh.mode == "per_frame" and self.asset is None:
+            raise BadInput(
+                f"pack.fps={self.settings.pack.fps:g} resamples the motion of one mesh, and mesh.mode=per_frame makes "
+                "a mesh per frame of the driving video; leave pack.fps (--fps) out, or add --set mesh.mode=tracked"
+            )
         self.check_licenses()
-        for name in self._weights():
-            open_weights(name)
+        require_weights(self._weights())
 
     def check_names(self) -> None:
         """Refuse names that folders, records or pages cannot hold.
@@ -133,7 +152,7 @@ class ConversionRequest(Frozen):
                 source=self._put_source(asset, store),
                 asset=asset,
                 text=sources.single_spaced(self.text),
-                moving=self._suffix in sources.ALWAYS_MOVING or self.video is not None,
+                moving=self._must_move,
                 bank=sources.put_bank(self.bank, store) if self.bank is not None else None,
                 mask=sources.put_source(self.mask, store) if self.mask is not None else None,
                 depth=sources.put_still(self.depth, store) if self.depth is not None else None,
@@ -161,8 +180,11 @@ class ConversionRequest(Frozen):
         return self.video or self.picture
 
     @property
-    def _suffix(self) -> str:
-        return self._footage.suffix.lower() if self._footage else ""
+    def _must_move(self) -> bool:
+        """True if a source that turns out to be a single picture is refused."""
+        return self.video is not None or (
+            self.picture is not None and self.picture.suffix.lower() in sources.ALWAYS_MOVING
+        )
 
     def _check_asset(self, asset: Path) -> None:
         models.check_model(asset)
@@ -214,7 +236,7 @@ class ConversionRequest(Frozen):
         tree = self.settings.model_dump(mode="json")
         if not self.text:
             del tree["text"]
-        if self.video is not None or self._suffix in sources.VIDEOS:
+        if self.has_motion:
             del tree["driving"]
         return list(weights_in(tree))
 

@@ -59,8 +59,11 @@ class ViewsRequest(Frozen):
         named = (*(view.path for view in self.views), self.turntable, self.cameras)
         return tuple(path for path in named if path is not None)
 
-    def check(self) -> None:
+    def check(self, source: Path | None) -> None:
         """Validate files and directions.
+
+        Args:
+            source: file of the input.
 
         Raises:
             BadInput: says what is wrong and what to do.
@@ -73,7 +76,7 @@ class ViewsRequest(Frozen):
             naming.check_text(path.name, "the file name")
             naming.check_path(path)
         for view in self.views:
-            sources.check_file(view.path)
+            sources.check_file(view.path, "give a picture")
         check_apart([(view.azimuth, view.elevation, view.path.name) for view in self.views])
         if self.turntable is not None:
             sources.check_video(self.turntable)
@@ -81,13 +84,15 @@ class ViewsRequest(Frozen):
             for path, _ in _frames(self.cameras):
                 naming.check_text(path.name, "the file name")
                 sources.check_file(path)
+            self._cameras(source)
 
     def put(self, store: ArtifactStore, source: Path | None) -> ArtifactRef | None:
         """Store the files with their directions; None without any.
 
         Args:
             store: destination.
-            source: file of the input, which names its camera; the first camera is taken if none has this name.
+            source: file of the input. Its camera is that of the same file, else of the only file with its name, else
+                the first one.
         """
         if not self:
             return None
@@ -120,10 +125,23 @@ class ViewsRequest(Frozen):
         return GivenViews(views=views, turntable="turntable" if self.turntable else "")
 
     def _cameras(self, source: Path | None) -> tuple[TransformsFrame, list[tuple[Path, TransformsFrame]]]:
-        """Return the frame of the input and those of the other cameras, with their files."""
+        """Return the frame of the input and those of the other cameras, with their files.
+
+        Raises:
+            BadInput: several cameras may be that of the input.
+        """
         assert self.cameras is not None
         frames = _frames(self.cameras)
-        own = next((i for i, (path, _) in enumerate(frames) if source is not None and path.name == source.name), 0)
+        found: list[int] = []
+        if source is not None:
+            same = [i for i, (path, _) in enumerate(frames) if path.resolve() == source.resolve()]
+            found = same[:1] or [i for i, (path, _) in enumerate(frames) if path.name == source.name]
+            if len(found) > 1:
+                raise BadInput(
+                    f"{self.cameras.name} names {len(found)} files {source.name}, and the input is none of them but "
+                    "has their name; give one of them as the input, or rename it"
+                )
+        own = found[0] if found else 0
         return frames[own][1], frames[:own] + frames[own + 1 :]
 
 

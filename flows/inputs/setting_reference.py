@@ -136,7 +136,9 @@ def _of_model(model: type[BaseModel], prefix: str) -> Iterator[Setting]:
 
 def _summary(schema: Schema) -> str:
     text: str = schema["description"].splitlines()[0].rstrip(".")
-    return text if text[:2].isupper() else text[:1].lower() + text[1:]
+    first = text.split(maxsplit=1)[0]
+    is_name = first[1:] != first[1:].lower() or any(map(str.isdigit, first))
+    return text if is_name else text[:1].lower() + text[1:]
 
 
 def _allowed(field: Schema, items: Schema | None) -> str:

@@ -46,24 +46,28 @@ def resolve_inside(folder: Path, name: str, what: str) -> Path:
     return path
 
 
-def check_file(path: Path) -> None:
+def check_file(path: Path, wanted: str = "give a picture or a video") -> None:
     """Refuse files that are not a picture, a video or a zip of frames.
+
+    Args:
+        path: file that is read.
+        wanted: advice where it is missing or empty.
 
     Raises:
         BadInput: says what the file is and what to give.
     """
     if not path.exists():
-        raise BadInput(f"{path} does not exist; give a picture or a video")
+        raise BadInput(f"{path} does not exist; {wanted}")
     if path.is_dir():
         raise BadInput(
             f"{path} is a folder; give one file, or `dg4d batch {path} -o DIR` for everything in it, "
             f"or `--video {path}` if it holds the frames of a video"
         )
     if not path.is_file():
-        raise BadInput(f"{path} is not a regular file; give a picture or a video")
+        raise BadInput(f"{path} is not a regular file; {wanted}")
     size = path.stat().st_size
     if size == 0:
-        raise BadInput(f"{path} is empty (0 bytes); give a picture or a video")
+        raise BadInput(f"{path} is empty (0 bytes); {wanted}")
     if size > LARGEST_FILE_BYTES:
         raise BadInput(f"{path} has {size} bytes; at most {LARGEST_FILE_BYTES} are read: shorten it")
     try:
@@ -117,7 +121,7 @@ def check_still_file(path: Path, option: str) -> None:
     if path.is_dir():
         raise BadInput(f"{option}: {path} is a folder; {wanted}")
     try:
-        check_file(path)
+        check_file(path, wanted)
     except BadInput as error:
         raise BadInput(f"{option}: {error}") from error
     try:

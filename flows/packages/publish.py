@@ -276,7 +276,9 @@ def _recover(folder: Path, place: Path) -> None:
     """Clean up after commands that were killed while they published."""
     for left in sorted(place.glob(f".{glob.escape(folder.name)}.*-*")):
         kind, _, pid = left.name.removeprefix(f".{folder.name}.").partition("-")
-        if kind not in {"incoming", "outgoing"} or not pid.isdigit() or Path(f"/proc/{pid}").exists():
+        if kind not in {"incoming", "outgoing"} or not pid.isdigit():
+            continue
+        if int(pid) != os.getpid() and Path(f"/proc/{pid}").exists():  # in containers, process ids are used again
             continue
         if kind == "incoming":
             remove_tree(left)

@@ -27,7 +27,9 @@ from steps.contract import RUN_ONLY
 from steps.store.artifact_store import ArtifactStore
 
 BESIDE = ("report.json", "report.html", VIEWER, CRATE)
-GENERATIVE = ("draw_picture", "drive_video", "fit_gaussians", "fit_motion", "refine_texture")  # if they use weights
+GENERATIVE = (  # steps that generate parts of the asset if they use weights
+    "draw_picture", "generate_views", "drive_video", "fit_gaussians", "fit_motion", "refine_texture",
+)  # fmt: skip
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -155,9 +157,22 @@ def banner(job: ConversionJob, result: FlowResult) -> str:
     if job.settings.prior.kind == "oracle":
         return f"Test of the optimization: ground-truth views were given; {motion}."
     drawn = "the picture was generated from text; " if job.drawn else ""
-    weights = result.used_weights("fit_gaussians", "fit_motion")
-    shape = "by a model" if weights else "without a model, from the silhouette of one picture"
-    return f"{job.profile.capitalize()}: {drawn}{motion}; shape and unseen sides were guessed {shape}."
+    return f"{job.profile.capitalize()}: {drawn}{motion}; {_shape(job, result)}."
+
+
+def _shape(job: ConversionJob, result: FlowResult) -> str:
+    """Say which part of the shape was given, and how the rest was guessed."""
+    if job.asset is not None:
+        return "the shape is that of the given model"
+    if job.settings.prior.kind == "learned" and not result.used_weights("generate_views"):
+        guessed, source = "by a small network", " from one view"
+    elif result.used_weights("generate_views", "fit_gaussians", "fit_motion"):
+        guessed, source = "by a model", ""
+    else:
+        guessed, source = "without a model", ", from the silhouette of one picture"
+    if job.views is not None:
+        return f"the shape was fitted to the given views; what none of them shows was guessed {guessed}"
+    return f"shape and unseen sides were guessed {guessed}{source}"
 
 
 def notes(job: ConversionJob, result: FlowResult) -> list[str]:

@@ -6,12 +6,14 @@ from uuid import uuid4
 
 from prefect.client.orchestration import get_client
 from prefect.events import Event, Resource
+from prefect.exceptions import ObjectNotFound
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BackendUnavailable, BadInput
 from steps.contract import digest_of
 from steps.store.files import write_atomically
 
 CHANGED = "dg4d.folder.changed"  # event of the trigger in deploy/prefect.yaml
+DEPLOYMENT, TRIGGER = "catalog-to-4d/Catalog to 4D", "dg4d catalog of a dropped folder"  # names, likewise
 
 Stamps = dict[str, tuple[int, int]]
 
@@ -73,6 +75,22 @@ class Watcher:
             with (self.folder / name).open("rb") as file:
                 self._contents[key] = hashlib.file_digest(file, "sha256").hexdigest()
         return self._contents[key]
+
+
+def check_registered() -> None:
+    """Refuse a server without the deployment that an announcement starts, or without its trigger.
+
+    Raises:
+        BackendUnavailable: it has none, so that announced files would be lost.
+    """
+    with get_client(sync_client=True) as client:
+        try:
+            client.read_deployment_by_name(DEPLOYMENT)
+            is_there = client.find_automation(TRIGGER) is not None
+        except ObjectNotFound:
+            is_there = False
+    if not is_there:
+        raise BackendUnavailable(f"the Prefect server lacks {DEPLOYMENT!r} or its trigger; run `dg4d up` first")
 
 
 def announce(folder: Path, out: Path, digest: str) -> None:

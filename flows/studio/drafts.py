@@ -3,10 +3,12 @@
 uploads/ID/files/NAME        files as handed in, under cleaned names
 uploads/ID/mask.png          matte drawn by the user, of the size of the first file
 uploads/ID/runs/KEY/NAME     links to the files of one conversion, named as the asset
+uploads/ID/batch-KEY.json    manifest of a batch of all files
 """
 
 import asyncio
 import io
+import json
 import os
 import re
 import secrets
@@ -28,9 +30,8 @@ from flows.inputs.sources import LARGEST_FILE_BYTES
 from steps.sources.media_types import (
     SNIFFED_BYTES,
     check_media,
-    container_of,
     is_animated_png,
-    is_zip,
+    is_video,
 )
 from steps.store.files import home as home_folder
 from steps.store.files import room_for, write_atomically
@@ -205,6 +206,17 @@ class Draft:
             os.link(path, target)
         return target
 
+    def write_manifest(self, key: str) -> Path:
+        """Write a manifest with a row for every file, whatever its suffix, and return its path.
+
+        Raises:
+            DiskFull: there is no room.
+        """
+        path = self.folder / f"batch-{key}.json"
+        rows = [{"path": each.path.relative_to(self.folder).as_posix()} for each in self.uploads()]
+        write_atomically(path, json.dumps(rows))
+        return path
+
 
 def most_bytes() -> int:
     """Return the largest number of bytes of a file that is taken.
@@ -249,7 +261,7 @@ def kind_of(path: Path) -> Kind:
         return "model"
     with path.open("rb") as file:
         head = file.read(SNIFFED_BYTES)
-    return "video" if is_zip(head) or is_animated_png(head) or container_of(head) else "picture"
+    return "video" if is_animated_png(head) or is_video(path) else "picture"
 
 
 async def _write(write: Callable[[bytes], object], chunks: AsyncIterator[bytes]) -> None:

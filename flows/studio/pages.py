@@ -17,7 +17,6 @@ from flows.studio.drafts import Draft, Upload
 from flows.studio.remedies import remedies
 from flows.studio.server_api import ServerApi
 from flows.studio.submission import GPU, draft_tag
-from steps.profiles import PROFILES
 
 SIDES = ("90", "180", "-90")  # azimuths in degrees, suggested for further pictures in their order
 RECENT = 12  # runs that the front page shows
@@ -31,6 +30,7 @@ DESCRIPTIONS = {
     "release": "the public code's first release; GPU and weights",
     "reference": "the authors' public code; GPU and weights",
     "quality": "best of four motions, finer mesh; GPU and weights",
+    "open": "models quoted as Apache-2.0; GPU and weights",
 }
 HEADERS = {
     "Content-Security-Policy": (
@@ -83,7 +83,7 @@ class Pages:
             others=others,
             suggested=dict(zip([each.name for each in others if each.kind == "picture"], SIDES, strict=False)),
             motions=MOTIONS if first.kind != "video" else (),
-            profiles={name: DESCRIPTIONS.get(name, "") for name in PROFILES},
+            profiles=DESCRIPTIONS,
             runs=runs,
             masks=_takes_mask(first),
         )

@@ -122,7 +122,10 @@ def entry_address(archive: ArtifactRef) -> str:
 
 def _source(upload: Upload) -> ArtifactRef:
     status = upload.path.stat()
-    return _stored(upload.path, upload.kind == "model", status.st_mtime_ns, status.st_size)
+    facts = upload.path, upload.kind == "model", status.st_mtime_ns, status.st_size
+    if not home.store().has(_stored(*facts)):  # `dg4d store gc` removed it
+        _stored.cache_clear()
+    return _stored(*facts)
 
 
 @functools.lru_cache(256)

@@ -46,7 +46,7 @@ class Submission(Frozen):
     """
 
     name: str = Field("", max_length=200)
-    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality"] = "preview"
+    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"] = "preview"
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
     motion: Motion | None = None
     box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field((), max_length=4)
@@ -108,10 +108,10 @@ def _batch(draft: Draft, wanted: Submission) -> Order:
         raise BadInput("a batch takes pictures and videos; drop models one at a time")
     if not files:
         raise BadInput("this draft has no files yet; drop a folder of pictures")
-    name = _item(wanted.name or f"batch of {len(files)}")
+    name, key = _item(wanted.name or f"batch of {len(files)}"), secrets.token_hex(6)
     parameters = {
-        "inputs": str(draft.files_folder),
-        "out": str(home.studio_assets() / f"batch-{secrets.token_hex(6)}"),
+        "inputs": str(draft.write_manifest(key)),
+        "out": str(home.studio_assets() / f"batch-{key}"),
         "options": _options(wanted, with_motion=True),
     }
     return Order(_deployment("catalog-to-4d", "Catalog", wanted.profile), name, parameters, (draft_tag(draft),))

@@ -130,7 +130,7 @@ def _checked_settings(request: StepRequest, spec: StepSpec) -> BaseModel:
     try:
         return settings_class(spec).model_validate(request.settings)
     except ValidationError as error:
-        raise BadInput(f"settings of {spec.name} refused: {settings_errors(error)}") from error
+        raise BadInput(f"settings of {spec.name} refused: {settings_errors(error, request.settings)}") from error
 
 
 def _fetch_inputs(request: StepRequest, spec: StepSpec, store: ArtifactStore, scratch: Path) -> dict[str, Path]:

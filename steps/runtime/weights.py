@@ -62,6 +62,29 @@ def open_weights(name: str) -> LocatedWeights:
     return LocatedWeights(folder, digests, {name: str(license_of(name))})
 
 
+def require_weights(names: Iterable[str]) -> None:
+    """Refuse weights that are not installed.
+
+    Raises:
+        BadInput: a name is neither in the registry, nor a hub id, nor a folder.
+        BackendUnavailable: names all that are missing or not complete, and the command that installs them.
+    """
+    missing = {}
+    for name in names:
+        try:
+            open_weights(name)
+        except BackendUnavailable as error:
+            missing[name] = error
+    if len(missing) == 1:
+        raise next(iter(missing.values()))
+    if missing:
+        sizes = {name: lookup_weights(name).about_gb for name in missing}
+        shown = ", ".join(f"{name} (about {size:g} GB)" if size else name for name, size in sizes.items())
+        raise BackendUnavailable(
+            f"weights are not on this machine, or not complete: {shown}; run `dg4d weights pull {' '.join(missing)}`"
+        )
+
+
 def license_of(name: str) -> License:
     """Return the license of weights from the registry, else from the model card that was downloaded with them."""
     locked = read_lock(weights_home()).get(name)

@@ -10,12 +10,13 @@ import av
 import torch
 from av.error import FFmpegError
 from av.video.codeccontext import VideoCodecContext
-from jaxtyping import Float
+from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.downscaling import downscale_in_bands
-from dg4d_lib.video.framing import downscaled_size
+from dg4d_lib.video.framing import downscaled_size, resample
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, check_size
 
@@ -27,6 +28,10 @@ MOST_DECODING_S = 900.0  # for one pass over a video; only hostile files take lo
 USUAL_FPS = 24.0  # assumed for files without a rate
 SAME_RATE = 0.02  # relative difference up to which the header's rate is preferred to the time stamps
 HELD_FRAMES = 4  # frames that a decoder keeps at least: references and reordered ones
+MOST_STRETCHED = 4.0  # ratio of the sides of a pixel; more extreme values of a header are taken as this
+UNEVEN = 0.05  # share of the duration by which frames may be played before or after their time without a note
+HDR_CURVES = (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67)  # PQ and HLG
+WIDE_PRIMARIES = (ColorPrimaries.BT2020, ColorPrimaries.SMPTE432)  # the second is Display P3
 ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # FFmpeg's own decoders drop the alpha plane of WebM
 
 
@@ -40,6 +45,24 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 def thinned_rate(fps: float, count: int, kept: int) -> float:
     """Return the frame rate at which `kept` of `count` frames last as long as all of them."""
     return fps * (kept - 1) / (count - 1) if count > 1 else fps
+
+
+def measured_rate(times: Sequence[float]) -> float:
+    """Return the mean frame rate between the first and the last of the times in seconds; 0 if they do not differ."""
+    span = times[-1] - times[0] if times else 0.0
+    return (len(times) - 1) / span if span > 0 else 0.0
+
+
+def uneven_note(times: Sequence[float]) -> tuple[str, ...]:
+    """Return a note if frames at these times, in seconds, look different when they are played at an even rate."""
+    rate = measured_rate(times)
+    late = max((abs((time - times[0]) * rate - i) for i, time in enumerate(times)), default=0.0)
+    if late <= UNEVEN * (len(times) - 1):
+        return ()
+    return (
+        "The video's frames have uneven times; they are played at an even rate, so that parts of the "
+        "motion are slower or faster. Export the video at a constant frame rate to keep its speed.",
+    )
 
 
 def work_side(count: int) -> int:
@@ -83,30 +106,34 @@ class Clip:
         count: frames that can be decoded.
         announced: number of frames in the header; 0 if absent.
         fps: frames per second.
-        size: width and height of the upright frames in pixels, before shrinking; known after `read`.
+        size: width and height of the upright frames in square pixels, before shrinking; known after `read`.
+        notes: sentences for the report about times and colors; complete after `read`.
     """
 
     size: tuple[int, int] = (0, 0)
 
     def __init__(self, path: Path, container: str, limit: DecodeLimit) -> None:
         self._path, self._container, self._limit = path, container, limit
-        times = [frame.time for frame in self._frames()]
+        times: list[float | None] = [frame.time for frame in self._frames()]
         self.count = len(times)
         if self.announced > 0 and self.count == 0:
             raise BadInput(
                 f"the video is cut off or broken: none of its {self.announced} frames can be read; copy it again"
             )
-        self.fps = self._rate(times)
+        known = [time for time in times if time is not None]
+        self.fps, self.notes = self._rate(known), uneven_note(known)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
         """Return the frames of these ascending indices, and True if the codec carries alpha."""
-        kept, has_alpha = KeptFrames(indices, "the video"), False
+        kept, has_alpha, colors = KeptFrames(indices, "the video"), False, _Colors()
         for i, frame in enumerate(self._frames()):
             if i in kept:
                 has_alpha = has_alpha or any(part.is_alpha for part in frame.format.components)
-                kept.add(i, _picture(frame, kept.side, has_alpha))
-                turned = round(frame.rotation / 90) % 2
-                self.size = (frame.height, frame.width) if turned else (frame.width, frame.height)
+                width, height = max(1, round(frame.width * self._pixel_aspect)), frame.height
+                check_size(width, height, "the video")
+                kept.add(i, _picture(frame, width, kept.side, has_alpha, colors))
+                self.size = (height, width) if round(frame.rotation / 90) % 2 else (width, height)
+        self.notes = (*self.notes, *colors.notes)
         return kept.frames, has_alpha
 
     def _frames(self) -> Iterator[av.VideoFrame]:
@@ -123,6 +150,8 @@ class Clip:
                     check_size(context.width, context.height, "the video")
                     self._require(context.width, context.height, context.pix_fmt)
                 self.announced = stream.frames
+                stretched = float(stream.sample_aspect_ratio or 1)
+                self._pixel_aspect = min(max(stretched, 1 / MOST_STRETCHED), MOST_STRETCHED)
                 self._header_rate = float(stream.average_rate or 0)
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
                 decoder = cast(VideoCodecContext, av.CodecContext.create(name, "r")) if name else context
@@ -154,21 +183,41 @@ class Clip:
                 raise BadInput(f"the video takes more than {MOST_DECODING_S:g} s to read; cut it, or export it smaller")
             yield frame
 
-    def _rate(self, times: Sequence[float | None]) -> float:
+    def _rate(self, times: Sequence[float]) -> float:
         """Return the header's frame rate, unless the time stamps contradict it."""
-        known = [time for time in times if time is not None]
-        span = known[-1] - known[0] if len(known) > 1 else 0.0
-        measured = (len(known) - 1) / span if span > 0 else 0.0
+        measured = measured_rate(times)
         if measured and abs(self._header_rate - measured) > SAME_RATE * measured:
             return measured
         return self._header_rate or measured or USUAL_FPS
 
 
-def _picture(frame: av.VideoFrame, side: int, has_alpha: bool) -> Float[Tensor, "h w 4"]:
-    """Return a frame as straight RGBA, upright, no side longer than `side`."""
-    width, height = frame.width, frame.height
-    if not has_alpha:  # FFmpeg's scaler does not weight colors by alpha
-        height, width = downscaled_size(height, width, side)
-    pixels = frame.reformat(width=width, height=height, format="rgba", interpolation="AREA").to_ndarray()
-    picture = downscale_in_bands(torch.from_numpy(pixels), side)
+class _Colors:
+    """Converter of frames to 8-bit RGBA in sRGB, kept for all frames: FFmpeg needs seconds to prepare one for HDR.
+
+    Attributes:
+        notes: a sentence if colors of a frame were HDR or of a wide gamut.
+    """
+
+    def __init__(self) -> None:
+        self._reformatter = VideoReformatter()
+        self.notes: tuple[str, ...] = ()
+
+    def pixels(self, frame: av.VideoFrame, width: int, height: int) -> UInt8[Tensor, "h w 4"]:
+        """Return a frame resized to these pixels."""
+        curve, primaries = None, None  # those of the frame
+        is_hdr = frame.color_trc in HDR_CURVES
+        if is_hdr or frame.color_primaries in WIDE_PRIMARIES:
+            curve, primaries = ColorTrc.IEC61966_2_1 if is_hdr else None, ColorPrimaries.BT709
+            self.notes = (f"The video's {'HDR' if is_hdr else 'wide-gamut'} colors are converted to sRGB.",)
+        target = {"dst_color_trc": curve, "dst_color_primaries": primaries}
+        resized = self._reformatter.reformat(frame, width, height, "rgba", interpolation="AREA", **target)
+        return torch.from_numpy(resized.to_ndarray())
+
+
+def _picture(frame: av.VideoFrame, width: int, side: int, has_alpha: bool, colors: _Colors) -> Float[Tensor, "h w 4"]:
+    """Return a frame as straight RGBA, upright, stretched to `width` and then shrunk so that no side exceeds `side`."""
+    height, width = downscaled_size(frame.height, width, side)
+    size = (frame.width, frame.height) if has_alpha else (width, height)  # FFmpeg's scaler does not weight by alpha
+    picture = downscale_in_bands(colors.pixels(frame, *size), side)
+    picture = resample(picture[None], height, width)[0]
     return torch.rot90(picture, round(frame.rotation / 90)).contiguous()

@@ -1,5 +1,6 @@
-"""Check for truncated GIF files, whose missing pixels FFmpeg fills without an error."""
+"""Frames of GIF files, by their blocks: FFmpeg fills missing pixels of a truncated file without an error."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,16 +20,28 @@ def check_first_frame(path: Path) -> None:
     """
     try:
         with path.open("rb") as file:
-            _skip_first_frame(file)
+            _skip_screen(file)
+            _skip_frame(file)
     except EOFError as error:
         raise BadInput(
             "the GIF is cut off or broken: it ends within its first frame; copy or export it again"
         ) from error
 
 
-def _skip_first_frame(file: BinaryIO) -> None:
-    """Read to the end of the first frame, or of the block in its place."""
+def has_two_frames(path: Path) -> bool:
+    """Return True for a GIF with two whole frames or more."""
+    with suppress(EOFError), path.open("rb") as file:
+        _skip_screen(file)
+        return _skip_frame(file) and _skip_frame(file)
+    return False
+
+
+def _skip_screen(file: BinaryIO) -> None:
     _skip_palette(file, _read(file, SCREEN_BYTES)[SCREEN_FLAGS])
+
+
+def _skip_frame(file: BinaryIO) -> bool:
+    """Read to the end of the next frame, or of the block in its place; return True if it is a frame."""
     while (block := _read(file, 1)) == EXTENSION:
         _read(file, 1)
         _skip_data(file)
@@ -36,6 +49,7 @@ def _skip_first_frame(file: BinaryIO) -> None:
         _skip_palette(file, _read(file, IMAGE_BYTES)[IMAGE_FLAGS])
         _read(file, 1)  # LZW code size
         _skip_data(file)
+    return block == IMAGE
 
 
 def _skip_palette(file: BinaryIO, flags: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from steps.artifacts.archives import MOST_ENTRIES, ZIP_ERRORS
+from steps.sources.gif import has_two_frames
 
 SNIFFED_BYTES = 4096  # beginning of a file, from which it is recognized
 
@@ -110,6 +111,19 @@ def is_animated_png(head: bytes) -> bool:
             return bool(name == b"acTL")
         at += 12 + length
     return False
+
+
+def is_video(path: Path) -> bool:
+    """Return True for a file that cannot be a single picture: a video, a zip of frames, or a GIF with two frames.
+
+    False for animated PNG and WebP, whose frames are counted when they are decoded, and for what cannot be read.
+    """
+    try:
+        head = _head(path)
+        container = container_of(head)
+    except BadInput:
+        return False
+    return has_two_frames(path) if container == "gif" else bool(container) or is_zip(head)
 
 
 def is_text(head: bytes) -> bool:

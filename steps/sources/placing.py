@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -23,6 +22,7 @@ def place_pictures(
     given: GivenViews,
     sources: Sequence[Source],
     source: Source,
+    whole: Float[Tensor, "1 s2 s2 4"],
     inputs: Float[Tensor, "t s s 4"],
     cut_out: Callable[[Source, int], Float[Tensor, "n s s 4"]],
 ) -> list[list[KnownView]]:
@@ -34,8 +34,9 @@ def place_pictures(
         given: views with their cameras, and the camera of the input.
         sources: decoded files of the views.
         source: decoded file of the input.
+        whole: its first frame, cut out as `inputs` and without a crop.
         inputs: frames of the input, cut out and framed.
-        cut_out: cuts the subject out of a file, without a crop, in squares of at most so many pixels.
+        cut_out: cuts the subject out of the file of a view, without a crop, in squares of at most so many pixels.
 
     Raises:
         BadInput: the cameras look away from the subject, from above, or two of them are one.
@@ -44,7 +45,6 @@ def place_pictures(
     cameras = [given.input_camera, *(view.camera for view in given.views if view.camera is not None)]
     poses = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
     size = inputs.shape[1]
-    whole = cut_out(replace(source, frames=source.frames[:1]), size)
     scale, offset = _framing(_box(inputs[:1], 2 / size, 1), _tangent_box(whole, given.input_camera, source))
     origin = _origin(poses, meeting_point(poses), scale, offset)
     places = orbit_places(poses, 0, origin)

@@ -21,6 +21,7 @@ from steps.sources.clips import (
     KeptFrames,
     evenly_spaced,
     thinned_rate,
+    uneven_note,
 )
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.decoder_errors import damage_is_bad_input
@@ -109,11 +110,13 @@ def _decode(path: Path, head: bytes, scratch: Path, max_frames: int, limit: Deco
     link.unlink(missing_ok=True)
     link.symlink_to(path.resolve())
     picture = read_still(link, "the picture", limit)
-    return _picture(picture.pixels[None], picture.has_alpha, picture.size)
+    return _picture(picture.pixels[None], picture.has_alpha, picture.size, picture.notes)
 
 
-def _picture(frames: Float[Tensor, "1 h w 4"], has_alpha: bool, size: tuple[int, int]) -> Source:
-    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture", size, 1)
+def _picture(
+    frames: Float[Tensor, "1 h w 4"], has_alpha: bool, size: tuple[int, int], notes: tuple[str, ...] = ()
+) -> Source:
+    return Source(frames, has_alpha and _is_transparent(frames), STILL_FPS, "picture", size, 1, notes)
 
 
 def _video(
@@ -145,7 +148,7 @@ def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) 
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
     lost = clip.announced - clip.count
     notes = (f"The video promises {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
-    return _video(frames, has_alpha, clip.fps, clip.count, clip.size, notes)
+    return _video(frames, has_alpha, clip.fps, clip.count, clip.size, (*notes, *clip.notes))
 
 
 def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
@@ -157,7 +160,9 @@ def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
             if i in kept:
                 kept.add(i, downscale_in_bands(frame, kept.side))
     size = clip.width, clip.height
-    return _picture(kept.frames, True, size) if len(clip) == 1 else _video(kept.frames, True, clip.fps, len(clip), size)
+    if len(clip) == 1:
+        return _picture(kept.frames, True, size)
+    return _video(kept.frames, True, clip.fps, len(clip), size, uneven_note(clip.times))
 
 
 def _need_two(count: int, what: str) -> None:
@@ -174,18 +179,19 @@ def _read_zip(path: Path, scratch: Path, max_frames: int, limit: DecodeLimit) ->
             check_no_scene(archive.namelist())
             frame_files = (info for info in archive.infolist() if not info.is_dir() and is_frame_name(info.filename))
             entries = _numbered(list(frame_files))
-            frames, any_alpha, size = _zipped_frames(archive, entries, scratch, max_frames, limit)
+            frames, any_alpha, size, notes = _zipped_frames(archive, entries, scratch, max_frames, limit)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
         raise BadInput("the zip of frames is broken or encrypted; pack it again") from error
     note = f"A folder of frames has no frame rate; {FOLDER_FPS:g} per second are assumed."
-    return _video(frames, any_alpha, FOLDER_FPS, len(entries), size, (note,))
+    return _video(frames, any_alpha, FOLDER_FPS, len(entries), size, (note, *notes))
 
 
 def _zipped_frames(
     archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
-) -> tuple[Float[Tensor, "t h w 4"], bool, tuple[int, int]]:
-    """Decode every frame, so that none is broken; return the selected ones, True if one has alpha, and their size."""
+) -> tuple[Float[Tensor, "t h w 4"], bool, tuple[int, int], tuple[str, ...]]:
+    """Decode every frame, so that none is broken; return the selected ones, True if one has alpha, size and notes."""
     kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
+    notes: tuple[str, ...] = ()
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):
         picture = _zipped_picture(archive, info, scratch, limit, kept.side)
@@ -204,8 +210,8 @@ def _zipped_frames(
             )
         if i in kept:
             kept.add(i, picture.pixels)
-            any_alpha = any_alpha or picture.has_alpha
-    return kept.frames, any_alpha, first
+            any_alpha, notes = any_alpha or picture.has_alpha, notes or picture.notes
+    return kept.frames, any_alpha, first, notes
 
 
 def _numbered(entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:

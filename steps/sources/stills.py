@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.downscaling import BAND_BYTES, BandDownscaler
+from steps.sources.color_profiles import convert_to_srgb
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.still_headers import read_header
 
@@ -33,6 +34,7 @@ FLOATS = ("half", "float", "double")
 HALF = 0.5  # alpha from which a pixel has a value
 DEPTH_NAMES = ("z", "depth", "depth.z", "depth.v")  # of channels, or their ends after a dot; before red, green and blue
 LINEAR_FORMATS = ("openexr", "hdr")
+PREMULTIPLIED_FORMATS = ("openexr", "tiff")  # unless a file says otherwise
 FAINT_ALPHA = 1e-3  # premultiplied colors are divided by no smaller alpha
 
 AVIF_BYTES = 20  # per pixel: planes of up to 16 bits, and two 8-bit RGBA copies of Pillow's
@@ -50,11 +52,13 @@ class StillPicture(NamedTuple):
         pixels: straight sRGB and alpha in [0, 1], upright.
         has_alpha: True if the file has an alpha channel.
         size: width and height of the upright file, before shrinking.
+        notes: sentences for the report about colors.
     """
 
     pixels: Float[Tensor, "h w 4"]
     has_alpha: bool
     size: tuple[int, int]
+    notes: tuple[str, ...] = ()
 
 
 def check_size(width: int, height: int, what: str) -> None:
@@ -106,8 +110,11 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
             shrinker.add(top, torch.from_numpy(band))
     finally:
         file.close()
+    picture, profile = shrinker.picture(), spec.getattribute("ICCProfile")
+    is_profile = isinstance(profile, ndarray) and not still.is_linear  # a comment of a file may have this name, too
+    notes = convert_to_srgb(picture, profile.tobytes()) if is_profile else ()
     orientation = int(spec.get_int_attribute("Orientation", 1))
-    return _upright(shrinker.picture(), still.has_alpha, orientation, (still.width, still.height))
+    return _upright(picture, still.has_alpha, orientation, (still.width, still.height), notes)
 
 
 class StillValues(NamedTuple):
@@ -198,18 +205,22 @@ def _read_avif(path: Path, what: str, limit: DecodeLimit, longest: int) -> Still
             for top in range(0, height, rows):
                 band = image.crop((0, top, width, min(height, top + rows))).convert("RGBA")
                 shrinker.add(top, torch.from_numpy(np.array(band)).float() / 255)
+            picture = shrinker.picture()
+            notes = convert_to_srgb(picture, image.info.get("icc_profile") or b"")
             has_alpha, orientation = image.mode.endswith("A"), image.getexif().get(ORIENTATION, 1)
-            return _upright(shrinker.picture(), has_alpha, orientation, image.size)
+            return _upright(picture, has_alpha, orientation, image.size, notes)
     except (UnidentifiedImageError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise BadInput(f"{what} is a broken or too large AVIF; export it as PNG or JPEG") from error
 
 
-def _upright(pixels: Float[Tensor, "h w 4"], has_alpha: bool, orientation: int, size: tuple[int, int]) -> StillPicture:
+def _upright(
+    pixels: Float[Tensor, "h w 4"], has_alpha: bool, orientation: int, size: tuple[int, int], notes: tuple[str, ...]
+) -> StillPicture:
     """Undo EXIF's orientation, 1 to 8; other values mean 1."""
     if orientation in TRANSPOSED:
         pixels, size = pixels.transpose(0, 1), (size[1], size[0])
     flipped = [axis for axis, values in enumerate((FLIPPED_ROWS, FLIPPED_COLUMNS)) if orientation in values]
-    return StillPicture(pixels.flip(flipped).contiguous(), has_alpha, size)
+    return StillPicture(pixels.flip(flipped).contiguous(), has_alpha, size, notes)
 
 
 def _open(path: Path, what: str, limit: DecodeLimit) -> tuple[oiio.ImageInput, float]:
@@ -238,6 +249,7 @@ class _Still:
         width: pixels, as stored.
         height: pixels, as stored.
         has_alpha: True if the file has an alpha channel.
+        is_linear: True if it holds linear light.
     """
 
     def __init__(self, file: oiio.ImageInput, what: str, depth: bool = False) -> None:
@@ -245,6 +257,12 @@ class _Still:
         self._file, self._what, self._spec = file, what, file.spec()
         self.width, self.height = self._spec.width, self._spec.height
         self._channels, self.has_alpha = _rgba_channels(self._spec, depth)
+        self.is_linear = file.format_name() in LINEAR_FORMATS or str(self._spec.format) in FLOATS
+        self._is_premultiplied = (
+            self.has_alpha
+            and file.format_name() in PREMULTIPLIED_FORMATS
+            and not self._spec.get_int_attribute("oiio:UnassociatedAlpha")
+        )
         self._first, self._last = min(self._channels), max(self._channels) + 1
         self._rows = self._rows_at_once()
 
@@ -254,13 +272,12 @@ class _Still:
         Raises:
             BadInput: the file is cut off or broken.
         """
-        is_linear = self._file.format_name() in LINEAR_FORMATS or str(self._spec.format) in FLOATS
         for top in range(0, self.height, self._rows):
             pixels = self._pixels(top, min(self._rows, self.height - top))
             picture = _as_rgba(pixels, [channel - self._first for channel in self._channels])
-            if is_linear:
-                if self.has_alpha:
-                    picture[..., :3] /= np.maximum(picture[..., 3:], FAINT_ALPHA)
+            if self._is_premultiplied:
+                picture[..., :3] /= np.maximum(picture[..., 3:], FAINT_ALPHA)
+            if self.is_linear:
                 picture[..., :3] = _srgb(picture[..., :3])
             yield top, picture.clip(0, 1)
 

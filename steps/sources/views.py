@@ -137,23 +137,9 @@ Bounded = Annotated[float, Field(ge=-1e6, le=1e6)]  # larger ones are no places,
 Row = tuple[Bounded, Bounded, Bounded, Bounded]
 
 
-class TransformsFrame(_Loose):
-    """Frame of a transforms.json; intrinsics of its own win over the common ones."""
+class _Intrinsics(_Loose):
+    """Intrinsics of all frames, or of one."""
 
-    file_path: str = Field(min_length=1)
-    transform_matrix: Annotated[tuple[Row, ...], Field(min_length=3, max_length=4)]
-    fl_x: float | None = Field(None, gt=0)
-    cx: float | None = None
-    cy: float | None = None
-    w: int | None = Field(None, gt=0)
-    h: int | None = Field(None, gt=0)
-
-
-class Transforms(_Loose):
-    """Content of a transforms.json of nerfstudio: pinhole cameras in OpenGL axes."""
-
-    frames: tuple[TransformsFrame, ...] = Field(min_length=2, max_length=MOST_VIEWS + 1)
-    camera_angle_x: float | None = Field(None, gt=0, lt=math.pi)
     fl_x: float | None = Field(None, gt=0)
     cx: float | None = None
     cy: float | None = None
@@ -161,13 +147,34 @@ class Transforms(_Loose):
     h: int | None = Field(None, gt=0)
     k1: float = 0.0
     k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+
+    @property
+    def distortion(self) -> float:
+        """Largest distortion coefficient of the lens."""
+        return max(map(abs, (self.k1, self.k2, self.k3, self.k4, self.p1, self.p2)))
+
+
+class TransformsFrame(_Intrinsics):
+    """Frame of a transforms.json; intrinsics of its own win over the common ones."""
+
+    file_path: str = Field(min_length=1)
+    transform_matrix: Annotated[tuple[Row, ...], Field(min_length=3, max_length=4)]
+
+
+class Transforms(_Intrinsics):
+    """Content of a transforms.json of nerfstudio: pinhole cameras in OpenGL axes."""
+
+    frames: tuple[TransformsFrame, ...] = Field(min_length=2, max_length=MOST_VIEWS + 1)
+    camera_angle_x: float | None = Field(None, gt=0, lt=math.pi)
     camera_model: str = "OPENCV"
 
     @model_validator(mode="after")
     def _pinhole(self) -> Self:
-        bent = max(map(abs, (self.k1, self.k2, self.p1, self.p2)))
+        bent = max(self.distortion, *(frame.distortion for frame in self.frames))
         if bent > DISTORTED or "FISHEYE" in self.camera_model.upper():
             raise ValueError(f"the lens is distorted (coefficient {bent:g}); give undistorted pictures")
         return self

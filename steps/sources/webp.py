@@ -11,7 +11,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from steps.sources.clips import MOST_DECODED, MOST_FRAMES
+from steps.sources.clips import MOST_DECODED, MOST_FRAMES, measured_rate
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.decoder_errors import damage_is_bad_input
 from steps.sources.stills import check_size
@@ -35,7 +35,7 @@ class AnimatedWebp:
     """Frames of one file, which must stay open while they are read.
 
     Attributes:
-        fps: mean frame rate of the frames read so far; `FASTEST_FPS` if they have no duration.
+        times: seconds at which the frames begin that were read so far.
 
     Raises:
         BadInput: the file is damaged, or has too many or too large frames.
@@ -55,18 +55,23 @@ class AnimatedWebp:
             self._image = WebPImageFile(file)  # `Image.open` would warn about sizes that are allowed here
         if len(self) > MOST_FRAMES or len(self) * self.width * self.height > MOST_DECODED:
             raise BadInput(f"{NAME} has too many or too large frames; cut it, or export it smaller")
-        self.fps = FASTEST_FPS
+        self.times: list[float] = []
+
+    @property
+    def fps(self) -> float:
+        """Mean frame rate of the frames read so far; `FASTEST_FPS` if they have no duration."""
+        return measured_rate(self.times) or FASTEST_FPS
 
     def __len__(self) -> int:
         return int(self._image.n_frames)
 
     def __iter__(self) -> Iterator[UInt8[Tensor, "h w 4"]]:
         """Yield every composed frame as straight RGBA."""
-        duration_ms = 0.0
+        start_ms = 0.0
         for number in range(len(self)):
             with damage_is_bad_input(NAME):
                 self._image.seek(number)
                 frame = torch.from_numpy(np.array(self._image.convert("RGBA")))
-            duration_ms += self._image.info["duration"]
-            self.fps = 1000 * (number + 1) / duration_ms if duration_ms > 0 else FASTEST_FPS
+            self.times.append(start_ms / 1000)
+            start_ms += self._image.info["duration"]
             yield frame

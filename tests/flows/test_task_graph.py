@@ -41,11 +41,13 @@ def test_views_of_other_sides_reach_both_fits_and_belong_to_the_package(log: Pat
     for name in ("front.png", "back.png"):
         (tmp_path / name).write_text(picture(name))
     sides = ViewsRequest(views=parse_views([f"180={tmp_path / 'back.png'}"]))
-    request = ConversionRequest(item="two", picture=tmp_path / "front.png", settings=PREVIEW, given_views=sides)
+    front = tmp_path / "front.png"
+    request = ConversionRequest(item="two", picture=front, mask=front, settings=PREVIEW, given_views=sides)
     convert_job(request.to_job(home.store()), tmp_path / "out")
     assert "prepare_views" in ran(log) and store_is_sound()
     steps = json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]
     inputs = {step["step"]: step["inputs"] for step in steps}
+    assert inputs["prepare_views"]["mask"] == inputs["prepare_subject"]["mask"]
     assert inputs["fit_gaussians"]["known_views"] == inputs["fit_motion"]["known_views"]
     assert all("subject" not in given for step, given in inputs.items() if step.startswith("extract_mesh"))
 

@@ -291,7 +291,9 @@ TIFFS: dict[str, Make] = {
     "tiff: float": lambda: _float_tiff(1.0),
     "tiff: float, not a number": lambda: _float_tiff(np.nan),
     "tiff: float, infinite": lambda: _float_tiff(np.inf),
-    "tiff: 40 channels": lambda: written(".tif", "uint8", tuple("RGBA") + tuple(f"x{i}" for i in range(36))),
+    "tiff: 40 channels": lambda: written(
+        ".tif", "uint8", tuple("RGBA") + tuple(f"x{i}" for i in range(36)), **{"oiio:UnassociatedAlpha": 1}
+    ),
     "tiff: planes": lambda: written(".tif", "uint8", (), planarconfig="separate"),
     "tiff: tiles": lambda: written(".tif", "uint8", (), **{"tiff:write_exif": 0}),
     "tiff: big-endian": lambda: written(".tif", "uint16", (), endian="big"),

@@ -79,11 +79,21 @@ def walk(count: int) -> list[ndarray]:
     return [disc(6 + 2 * i) for i in range(count)]
 
 
-def save_clip(path: Path, frames: list[ndarray], codec: str, pixel_format: str, fps: int = 10, **options: str) -> Path:
-    """Encode RGBA frames with PyAV."""
+def save_clip(
+    path: Path,
+    frames: list[ndarray],
+    codec: str,
+    pixel_format: str,
+    fps: int = 10,
+    header: dict[str, object] | None = None,
+    **options: str,
+) -> Path:
+    """Encode RGBA frames with PyAV; `header` holds attributes of the codec's context."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, fps, options)
         stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], pixel_format
+        for name, value in (header or {}).items():
+            setattr(stream.codec_context, name, value)
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgba")))
         container.mux(stream.encode(None))

@@ -13,6 +13,7 @@ import trimesh
 from pxr import Usd, UsdGeom
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, inputs, job, packed, tracked
 
+from dg4d_lib.assets import resample
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.splats import read_splats
@@ -140,9 +141,18 @@ def test_another_frame_rate_keeps_the_length_and_the_frames(tmp_path: Path) -> N
     assert states.means[1, 0, 0].item() == pytest.approx(REACH / 4, abs=1e-6)
 
 
-def test_a_mesh_per_frame_keeps_the_rate_of_the_driving_video(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match=r"48 are asked for.*mesh\.mode=tracked"):
-        packed(tmp_path, "per_frame", fps=2 * FPS)
+@pytest.mark.parametrize(
+    ("mode", "states", "reason"),
+    [("per_frame", FRAMES, "every frame has its own mesh"), ("tracked", 5, "at most 5 states")],
+)
+def test_a_rate_that_cannot_be_had_is_noted(
+    mode: str, states: int, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (resample, pack_asset):
+        monkeypatch.setattr(module, "MAX_STATES", 5)
+    manifest = read_manifest(packed(tmp_path, mode, fps=2 * FPS, splats=False, spz=False, rig=False, usd=False))
+    assert (manifest.frames, manifest.fps) == (states, pytest.approx(states / FRAMES * FPS))
+    assert f"the files have {manifest.fps:g} frames per second instead of 48 (pack.fps): {reason}" in manifest.notes
 
 
 def test_levels_of_detail_have_their_share_of_the_triangles(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,25 +25,30 @@ from steps.runtime.job import Job, StepReport
 from steps.sources.views import VIEWS_JSON, GivenView, GivenViews, PlacedCamera
 
 SIZE = 96
-SETTINGS = PREVIEW.model_copy(update={"subject": SubjectSettings(size=SIZE)})
 
 
 class Workplace:
-    """A folder with a prepared input, to which views are added."""
+    """A folder with a prepared input, a picture or frames, to which views are added."""
 
-    def __init__(self, folder: Path, front: KnownView) -> None:
-        self.folder = folder
-        self.source = folder / "front.png"
-        write_png(self.source, front.cutout)
-        outputs = {port: folder / f"{port}.png" for port in ("subject", "footage", "pose", "picture")}
-        prepare_subject(Job({"source": self.source}, outputs, self.settings("prepare_subject"), 0, print, folder))
+    def __init__(
+        self, folder: Path, front: KnownView | bytes, mask: Path | None = None, box: tuple[int, ...] = ()
+    ) -> None:
+        self.folder, self.box = folder, box
+        self.files = {"source": folder / "front"} | ({"mask": mask} if mask else {})
+        self.files["source"].write_bytes(front if isinstance(front, bytes) else png(front, folder))
+        outputs = {port: folder / f"{port}.out" for port in ("footage", "pose")}
+        outputs |= {port: folder / f"{port}.png" for port in ("subject", "picture")}
+        prepare_subject(Job(self.files, outputs, self.settings("prepare_subject"), 0, print, folder))
+        if outputs["footage"].exists():
+            self.files["footage"] = outputs["footage"]
 
     def settings(self, step: str) -> object:
-        return step_settings(step, SETTINGS)
+        subject = SubjectSettings(size=SIZE, box=self.box)
+        return step_settings(step, PREVIEW.model_copy(update={"subject": subject}))
 
     def prepare(self, given: GivenViews, files: dict[str, bytes]) -> StepReport:
         write_zip(self.folder / "views.zip", [(VIEWS_JSON, given.model_dump_json().encode()), *files.items()])
-        inputs = {"views": self.folder / "views.zip", "source": self.source, "subject": self.folder / "subject.png"}
+        inputs = {**self.files, "views": self.folder / "views.zip", "subject": self.folder / "subject.png"}
         outputs = {"known_views": self.folder / "known.zip", "picture": self.folder / "views_picture.png"}
         for name in ("seen", "bank"):
             (self.folder / name).mkdir(exist_ok=True)
@@ -142,8 +148,20 @@ def placed(azimuth: float, elevation: float = 0.0) -> PlacedCamera:
     return PlacedCamera(matrix=[tuple(row) for row in matrix.tolist()], focal=OrbitCamera().focal / 256)
 
 
-def test_pictures_of_known_cameras_are_placed_by_them(tmp_path):
-    place = Workplace(tmp_path, seen(creature(), 0))
+def on_pedestal(view: KnownView) -> KnownView:
+    """Return the view with a block at the lower edge."""
+    cutout = view.cutout.clone()
+    cutout[-8:-1, SIZE // 3 : 2 * SIZE // 3] = torch.tensor([0.3, 0.3, 0.8, 1])
+    return replace(view, cutout=cutout)
+
+
+@pytest.mark.parametrize("excluded_by", ["", "mask", "box"])
+def test_pictures_of_known_cameras_are_placed_by_them(excluded_by, tmp_path):
+    front = seen(creature(), 0)
+    mask = tmp_path / "mask.png" if excluded_by == "mask" else None
+    write_png(tmp_path / "mask.png", front.cutout[..., 3:].expand(-1, -1, 3))
+    box = (0, 0, SIZE, SIZE - 8) if excluded_by == "box" else ()
+    place = Workplace(tmp_path, on_pedestal(front) if excluded_by else front, mask, box)
     files = {"000": png(seen(creature(), 75, 20), tmp_path), "001": png(seen(creature(), 200), tmp_path)}
     cameras = [placed(75, 20), placed(200)]
     views = [GivenView(file=f, name=f, camera=c) for f, c in zip(files, cameras, strict=True)]
@@ -152,6 +170,15 @@ def test_pictures_of_known_cameras_are_placed_by_them(tmp_path):
         assert (view.camera.azimuth_deg, view.camera.elevation_deg) == pytest.approx((azimuth, elevation), abs=1e-3)
         truth = seen(creature(), azimuth, elevation).cutout
         assert float(iou(view.cutout[None, ..., 3:], truth[None, ..., 3:])) > 0.95
+
+
+def test_synchronized_videos_have_as_many_frames_as_the_input_before_any_are_left_out(tmp_path):
+    place = Workplace(tmp_path, clip(tmp_path, [0.0] * 3))
+    views = tuple(GivenView(file=f, name=f, camera=placed(a)) for f, a in (("00", 75), ("01", 200)))
+    given = GivenViews(views=views, input_camera=placed(0))
+    place.prepare(given, {"00": clip(tmp_path, [75.0] * 3), "01": clip(tmp_path, [200.0] * 3)})
+    with pytest.raises(BadInput, match="01 has 6 frames and the input 3;"):
+        place.prepare(given, {"00": clip(tmp_path, [75.0] * 3), "01": clip(tmp_path, [200.0] * 6)})
 
 
 def test_a_video_among_pictures_is_refused(tmp_path):

@@ -1,10 +1,11 @@
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from tiny_svd import save_tiny_svd
-from tiny_weights import write_zero123
+from tiny_weights import write_scheduler, write_zero123
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
@@ -12,6 +13,7 @@ from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSet
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import write_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.fitting import priors
 from steps.profiles import PREVIEW, step_settings
 from steps.refine_texture import run
 from steps.runtime.job import Job, StepReport
@@ -97,6 +99,21 @@ def test_image_diffusion_is_the_alternative(folder: Path) -> None:
     assert "picture by picture" in facts.notes[0] and any("unet" in name for name in facts.weights)
     red, green, _ = read_tracked(folder / "tracked").mesh.texture[4:12, 4:12].mean((0, 1))
     assert red > 0.53 and green < 0.47
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "message"),
+    [("DDIMScheduler", r"set refiner\.prior\.variant=stable"), ("FlowMatchEulerDiscreteScheduler", "flow-matching")],
+)
+def test_other_models_than_the_settings_say_are_refused(
+    folder: Path, scheduler: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = write_zero123(folder / "zero123")
+    write_scheduler(weights / "scheduler", _class_name=scheduler)
+    unet = hashlib.sha256((weights / "unet" / "diffusion_pytorch_model.safetensors").read_bytes()).hexdigest()
+    monkeypatch.setattr(priors, "STABLE_UNET", unet)
+    with pytest.raises(BadInput, match=message):
+        refine(folder, "tracked", ImageToImageSettings(texture=TEXTURE, prior={"weights": str(weights)}))
 
 
 def test_the_identity_needs_no_step(folder: Path) -> None:

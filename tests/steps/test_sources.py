@@ -1,4 +1,5 @@
 import zipfile
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from media_files import (
     save_zip,
     walk,
 )
+from PIL import Image
 
 from dg4d_lib.errors import BadInput
 from steps.sources.clips import evenly_spaced, thinned_rate, work_side
@@ -223,6 +225,31 @@ def test_many_frames_share_a_bounded_amount_of_memory():
 def test_wide_frames_are_shrunk_while_they_are_decoded(tmp_path):
     wide = [np.zeros((360, 1440, 4), np.uint8)] * 2
     assert read(save_clip(tmp_path / "a.mp4", wide, "libx264", "yuv420p")).frames.shape == (2, 256, 1024, 4)
+
+
+@pytest.mark.parametrize(("codec", "pixels"), [("png", "rgba"), ("libx264", "yuv444p")])
+def test_frames_of_wide_pixels_are_as_wide_as_players_show_them(tmp_path, codec, pixels):
+    narrow = [frame[:, ::2] for frame in walk(3)]
+    path = save_clip(tmp_path / "a.mov", narrow, codec, pixels, header={"sample_aspect_ratio": Fraction(2)})
+    source = read(path)
+    assert source.frames.shape == (3, 64, 64, 4) and source.size == (64, 64)
+    inside = (source.frames[0, ..., 1] < 0.6) & (source.frames[0, ..., 3] > 0.5)
+    assert int(inside.any(0).sum()) == pytest.approx(32, abs=2) == int(inside.any(1).sum())
+    if source.has_alpha:  # nothing of the white around it
+        torch.testing.assert_close(source.frames[0][source.frames[0, ..., 3] > 0.1][:, :3].amax(0), COLOR)
+
+
+@pytest.mark.parametrize(("durations", "is_uneven"), [((2000, 50, 50, 50), True), ((90, 110, 90, 2000), False)])
+@pytest.mark.parametrize("suffix", [".gif", ".webp", ".apng"])
+def test_frames_that_are_held_are_noted(tmp_path, suffix, durations, is_uneven):
+    frames = [Image.fromarray(opaque(frame)) for frame in walk(4)]
+    options = {"PNG": {}, "WEBP": {"lossless": True}, "GIF": {}}
+    kind = {".apng": "PNG"}.get(suffix, suffix[1:].upper())
+    path = tmp_path / f"a{suffix}"
+    frames[0].save(path, kind, save_all=True, append_images=frames[1:], duration=durations, **options[kind])
+    source = read(path)
+    assert source.fps == pytest.approx(3000 / sum(durations[:3]), rel=1e-3)  # how long the last is held says nothing
+    assert any("uneven" in note for note in source.notes) == is_uneven
 
 
 # Folders of frames

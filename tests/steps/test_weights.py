@@ -12,6 +12,7 @@ from steps.runtime.weights import (
     license_note,
     license_of,
     open_weights,
+    require_weights,
     weights_home,
     weights_in,
     without_paths,
@@ -107,6 +108,13 @@ def test_a_request_for_other_weights_is_another_and_is_not_performed(home: Path,
 def test_missing_weights_are_missing_and_not_bad_input() -> None:
     with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
         open_weights("svd")
+
+
+def test_all_missing_weights_are_named_at_once(home: Path) -> None:
+    fill(home / "lgm")
+    with pytest.raises(BackendUnavailable, match=r"svd \(about .* GB\), .*`dg4d weights pull svd some/body`"):
+        require_weights(["svd", "lgm", "some/body"])
+    require_weights(["lgm"])
 
 
 def test_the_license_of_a_folder_is_that_of_its_card_under_its_path_and_its_stored_name(

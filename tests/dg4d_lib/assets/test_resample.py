@@ -13,6 +13,7 @@ from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.resample import (
     MAX_STATES,
     STATES_AT_ONCE,
+    highest_rate,
     pose_gaussians_in_chunks,
     resample_asset,
     resampled_positions,
@@ -112,6 +113,12 @@ def test_a_rate_of_too_many_states_is_refused_but_all_frames_never_are() -> None
         resampled_positions(1000, 7.0, 7.007)
     assert len(resampled_positions(2000, 7.0, 7.0)) == 2000
     assert len(resampled_positions(1000, 7.0, 7.0)) == MAX_STATES
+
+
+@pytest.mark.parametrize("frames", [1, 3, 32, 999, 1000, 1001])
+def test_the_highest_rate_gives_as_many_states_as_are_allowed(frames: int) -> None:
+    for fps in (0.53, 23.976, 1e3 / 7):
+        assert len(resampled_positions(frames, fps, highest_rate(frames, fps))) == max(frames, MAX_STATES)
 
 
 def test_states_in_parts_are_the_states(cloud: Gaussians) -> None:

@@ -12,6 +12,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.settings import TextureSettings
+from dg4d_lib.texture import refine
 from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -279,6 +280,28 @@ def test_black_texels_can_become_gray_within_the_papers_iterations() -> None:
     )
     step = begun.texture[8:24, 8:24].logit() - torch.tensor(1 / 512).logit()
     assert (step > 0.1).all() and (step < SETTINGS.lr + 1e-4).all()  # Adam's epsilon takes a part of small gradients
+
+
+@pytest.mark.parametrize(("is_tracked", "frame_size"), [(False, 0), (True, 0), (True, 64)])
+def test_longer_videos_change_textures_as_far(
+    is_tracked: bool, frame_size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Texels have more pixels here than at full size, so the epsilon of Adam is larger as well."""
+    monkeypatch.setattr(refine, "ADAM_EPS", 256e-8)
+    start, truth = box(painted()), box(painted(0.5))
+    settings = SETTINGS.model_copy(
+        update={"iterations": 8, "refresh_every": 8, "azimuth_step_deg": 0.0, "frame_size": frame_size}
+        | {"min_cosine": 1.0, "frame_weight": 0.0}  # without the input view, and the pull of residuals towards zero
+    )
+    textures = []
+    for frames in (2, 5):
+        meshes = [truth] * frames
+        lengths = [frames] if is_tracked else [1] * frames
+        clips = [MeshClip(start, torch.zeros(length, 16, 3)) for length in lengths]
+        refined = refine_textures(clips, driving_of(meshes), Oracle(meshes), settings, rng())[0]
+        textures.append(refined.texture if refined.frame_textures is None else refined.frame_textures[0])
+    assert error(textures[0], painted()) > 0.005
+    torch.testing.assert_close(*textures, rtol=0, atol=1e-4)
 
 
 def test_another_number_of_frames_is_refused() -> None:

@@ -122,8 +122,10 @@ def test_a_bank_without_the_oracle_and_the_oracle_without_a_bank() -> None:
     refused(dg4d("make", "cat.png", "--set", "prior.kind=oracle", "-o", "out"), "--bank DIR")
 
 
-def test_a_pick_where_a_video_is_followed() -> None:
-    refused(dg4d("make", "cat.png", "--video", "cat.png", "--pick", "2", "-o", "out"), "--pick")
+@pytest.mark.parametrize("source", [("cat.png", "--video", "walk.mp4"), ("walk.mp4",)])
+def test_a_pick_where_a_video_is_followed(source: tuple[str, ...]) -> None:
+    Path("walk.mp4").write_text(picture("walk"))
+    refused(dg4d("make", *source, "--pick", "2", "-o", "out"), "--pick chooses a generated motion, and walk.mp4")
 
 
 def test_wrong_usage() -> None:

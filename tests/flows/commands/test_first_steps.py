@@ -3,11 +3,13 @@
 import io
 import json
 import os
+import shlex
 from pathlib import Path
 
 import pytest
 from conversions import Run, ran
 from fake_steps import picture
+from PIL import Image
 from rich.console import Console
 
 from flows import convert
@@ -66,7 +68,27 @@ def test_motions_have_a_header_and_say_how_to_use_one(dg4d: Run) -> None:
     header = next(i for i, line in enumerate(lines) if line.split() == ["pick", "score", "motion,", "best", "first"])
     assert [line.split()[0] for line in lines[header + 1 : header + 4]] == ["1", "2", "3"]
     assert lines[header].index("score") == lines[header + 1].index("1.00")
-    assert lines[-1].endswith("dg4d make fox.png --pick 1")
+    assert lines[-1].endswith(": dg4d make --pick 1 fox.png")
+
+
+def test_the_command_after_motions_makes_the_motion_that_was_shown(dg4d: Run) -> None:
+    Image.new("L", (8, 6), 255).save("my mask.png")
+    options = ["--set", "driving.motion=bend", "--set", "driving.fps=9", "--profile", "video-fast", "--seed", "7",
+               "--mask", "my mask.png", "--box", "1,1,4,4", "--layers", "my mask.png", "--commercial-only"]  # fmt: skip
+    warp = ["--set", "driving.kind=warp", "--set", "prior.kind=geometric", "--set", "refiner.kind=identity"]
+    done = dg4d("motions", *warp, *options, "--candidates", "3", "-o", "sheet", "--", words("-fox.png", "1"))
+    assert done.exit_code == 0, done.output
+    _, _, command = done.stdout.splitlines()[-1].partition(": dg4d make ")
+    given = shlex.split(command)
+    assert given[-2:] == ["--", "-fox.png"]
+    assert sorted(given[:-2]) == sorted([*warp, *options, "--pick", "1"])
+
+
+def test_a_forced_name_counts_for_an_equal_picture(dg4d: Run) -> None:
+    assert dg4d("make", words("fox.png", "1"), "-o", "pk").exit_code == 0
+    done = dg4d("make", words("wolf.png", "1"), "-o", "pk", "--force")
+    assert done.exit_code == 0, done.output
+    assert json.loads(Path("pk/provenance.json").read_text())["item"] == "wolf"
 
 
 def test_lines_of_a_log_count_steps_and_tell_the_time_left() -> None:

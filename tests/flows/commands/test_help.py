@@ -69,8 +69,22 @@ def test_settings_refuses_a_misspelt_name_with_the_nearest() -> None:
     assert done.exit_code == 65 and "did you mean motion.iterations?" in done.output
 
 
-def test_output_that_nobody_reads_ends_the_command_without_a_message() -> None:
-    program = [sys.executable, "-P", "-m", "flows.cli", "settings"]
+BY_RICH = """
+from flows.commands.endings import exit_on_error
+from flows.commands.terminal import console
+import typer
+
+def hello() -> None:
+    with exit_on_error():
+        console().print("hello")
+
+typer.run(hello)
+"""
+
+
+@pytest.mark.parametrize("arguments", [["-m", "flows.cli", "settings"], ["-c", BY_RICH]], ids=["settings", "by rich"])
+def test_output_that_nobody_reads_ends_the_command_without_a_message(arguments: list[str]) -> None:
+    program = [sys.executable, "-P", *arguments]
     with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as started:
         assert started.stdout is not None and started.stderr is not None
         started.stdout.close()

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 from fake_steps import PNG, bank_json, picture
+from PIL import Image
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import backends
@@ -130,6 +131,32 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
         request(good, bank=bank).check()
 
 
+def test_what_has_no_effect_is_named(tmp_path: Path) -> None:
+    for name in ("a.png", "a.mp4"):
+        (tmp_path / name).write_text(picture("x"))
+    image, video = tmp_path / "a.png", tmp_path / "a.mp4"
+    driven = {"driving.motion": "wave"}
+    assert request(image, **driven).unused() == request(video).unused() == []
+    (motion,) = request(video, **driven).unused()
+    assert "driving.* settings" in motion and "a.mp4" in motion
+    assert request(image, video).unused() == ["a.png only names the asset: the subject is that of a.mp4"]
+
+
+def test_a_mesh_per_frame_is_not_resampled_but_a_given_model_is(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text(picture("x"))
+    faster = request(tmp_path / "a.png", **{"mesh.mode": "per_frame", "pack.fps": 24.0})
+    with pytest.raises(BadInput, match=r"pack\.fps=24 .* --set mesh\.mode=tracked"):
+        faster.check()
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    faster.model_copy(update={"asset": tmp_path / "a.obj"}).check()
+
+
+def test_a_depth_picture_that_is_missing_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text(picture("x"))
+    with pytest.raises(BadInput, match="does not exist; give one gray picture"):
+        request(tmp_path / "a.png").model_copy(update={"depth": tmp_path / "d.png"}).check()
+
+
 TEXT = {"text.weights": "somebody/pictures"}
 
 
@@ -214,14 +241,18 @@ def test_other_weights_are_another_order_and_their_place_does_not_count(
 def test_weights_that_no_step_will_load_need_not_be_here(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text(picture("x"))
     (tmp_path / "a.mp4").write_text(picture("x"))
-    (tmp_path / "a.gif").write_text(picture("x"))
+    still, second = (Image.new("L", (8, 8), value) for value in (0, 255))
+    still.save(tmp_path / "still.gif")
+    still.save(tmp_path / "moving.gif", save_all=True, append_images=[second])
+    (tmp_path / "cut.gif").write_bytes((tmp_path / "moving.gif").read_bytes()[:-8])
     animated = {"driving.kind": "svd"}
     request(tmp_path / "a.png", **{"text.weights": "not/here"}).check()
     request(tmp_path / "a.mp4", **animated).check()
-    request(tmp_path / "a.gif", **animated).check()  # whether it moves, its content says
+    request(tmp_path / "moving.gif", **animated).check()
     request(tmp_path / "a.png", video=tmp_path / "a.mp4", **animated).check()
-    with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
-        request(tmp_path / "a.png", **animated).check()
+    for name in ("a.png", "still.gif", "cut.gif"):
+        with pytest.raises(BackendUnavailable, match="`dg4d weights pull svd`"):
+            request(tmp_path / name, **animated).check()
 
 
 def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(weights: Path, tmp_path: Path) -> None:
@@ -232,6 +263,10 @@ def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(wei
 
     strict().check_licenses()
     strict(**{"driving.kind": "svd"}).check_licenses()
+    Image.new("L", (8, 8)).save(tmp_path / "still.gif")
+    drives = request(tmp_path / "still.gif", **{"driving.kind": "svd", "driving.model.weights": "somebody/pictures"})
+    with pytest.raises(BadInput, match="somebody/pictures"):
+        drives.model_copy(update={"commercial_only": True}).check_licenses()
     with pytest.raises(BadInput, match=r"--commercial-only: .* zero123-xl \("):
         strict(**{"prior.kind": "zero123"}).check_licenses()
     with pytest.raises(BadInput, match=r"stable-zero123 .*non-commercial"):

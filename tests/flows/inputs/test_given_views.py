@@ -52,7 +52,7 @@ def test_two_views_of_one_direction_are_refused(views, named, tmp_path, monkeypa
     for name in ("a.png", "b.png"):
         picture(tmp_path, name)
     with pytest.raises(BadInput, match=named):
-        ViewsRequest(views=parse_views(views)).check()
+        ViewsRequest(views=parse_views(views)).check(None)
 
 
 def test_views_travel_with_the_job_and_change_its_digest(tmp_path):
@@ -97,6 +97,19 @@ def test_the_camera_of_the_input_is_the_one_with_its_name(tmp_path):
         assert [view.name for view in given.views] == others and given.input_camera is not None
 
 
+def test_of_files_of_one_name_the_input_itself_names_its_camera(tmp_path):
+    files = [picture(tmp_path / f"cam{i}", "0.png").relative_to(tmp_path).as_posix() for i in range(3)]
+    matrices = [[[1, 0, 0, i], *MATRIX[1:]] for i in range(3)]
+    frames = [{"file_path": file, "transform_matrix": m} for file, m in zip(files, matrices, strict=True)]
+    path = transforms(tmp_path, frames=frames, camera_angle_x=0.9)
+    store = ArtifactStore(tmp_path / "store")
+    with zipfile.ZipFile(store.path(ViewsRequest(cameras=path).put(store, tmp_path / "cam1" / "0.png"))) as archive:
+        given = GivenViews.model_validate_json(archive.read("views.json"))
+    assert [camera.matrix[0][3] for camera in (given.input_camera, *(v.camera for v in given.views))] == [1, 0, 2]
+    with pytest.raises(BadInput, match=r"names 3 files 0\.png"):
+        ViewsRequest(cameras=path).check(picture(tmp_path / "elsewhere", "0.png"))
+
+
 def test_focal_lengths_are_in_widths_of_the_picture(tmp_path):
     own = read_transforms(transforms(tmp_path, "a.png", "b.png", fl_x=400, w=800, h=600, cx=200, cy=300))
     camera = own.camera(own.frames[0])
@@ -105,7 +118,12 @@ def test_focal_lengths_are_in_widths_of_the_picture(tmp_path):
 
 @pytest.mark.parametrize(
     ("more", "refusal"),
-    [({}, "no focal length"), ({"fl_x": 4, "w": 8, "h": 8, "k1": 0.3}, "distorted"), ({"fl_x": -1}, "transforms.json")],
+    [
+        ({}, "no focal length"),
+        ({"fl_x": 4, "w": 8, "h": 8, "k1": 0.3}, "distorted"),
+        ({"fl_x": -1}, "transforms.json"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": MATRIX, "k1": 0.3}] * 2}, "distorted"),
+    ],
 )
 def test_cameras_that_are_no_pinholes_are_refused(more, refusal, tmp_path):
     path = transforms(tmp_path, "a.png", "b.png", **more)
@@ -118,13 +136,13 @@ def test_files_outside_of_the_folder_of_cameras_are_refused(tmp_path):
     path = transforms(tmp_path / "in", "a.png", "b.png", camera_angle_x=0.9)
     path.write_text(path.read_text().replace('"b.png"', '"../outside.png"'))
     with pytest.raises(BadInput, match="leads out of the folder"):
-        ViewsRequest(cameras=path).check()
+        ViewsRequest(cameras=path).check(None)
 
 
 def test_cameras_exclude_other_views(tmp_path):
     path = transforms(tmp_path, "a.png", "b.png", camera_angle_x=0.9)
     with pytest.raises(BadInput, match="without --view"):
-        ViewsRequest(views=parse_views([f"90={tmp_path / 'a.png'}"]), cameras=path).check()
+        ViewsRequest(views=parse_views([f"90={tmp_path / 'a.png'}"]), cameras=path).check(None)
 
 
 def test_a_cell_of_a_manifest_holds_several_views_below_its_folder(tmp_path):

@@ -64,6 +64,12 @@ def test_a_section_lists_its_settings_and_a_name_one_per_kind() -> None:
     assert [one.only_with for one in find_settings("prior.weights")] == ["prior.kind=zero123", "prior.kind=imagedream"]
 
 
+def test_the_summary_of_a_kind_begins_with_a_small_letter_unless_with_a_name() -> None:
+    (one,) = find_settings("prior.kind")
+    assert "geometric: renders of" in one.meaning
+    assert "zero123: Zero-1-to-3: " in one.meaning and "imagedream: ImageDream: " in one.meaning
+
+
 def test_bounds_are_those_of_the_models() -> None:
     (one,) = find_settings("motion.t_max_start")
     assert one.allowed == "number, above 0.02, at most 1"

@@ -157,6 +157,16 @@ def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "package.zip"]
 
 
+def test_what_a_killed_process_of_the_same_number_left_does_not_block(package: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    left = tmp_path / f".out.outgoing-{os.getpid()}"  # as in a container, whose commands have one number
+    left.mkdir()
+    (left / "notes.txt").write_text("mine")
+    publish(package, out, finish)
+    assert tree(out)["notes.txt"] == "mine" and not left.exists()
+
+
 def test_an_entry_outside_the_package_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
         archive.writestr("../evil.txt", "x")

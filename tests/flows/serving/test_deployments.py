@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from conversions import Run
 from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterParentFlowRunId
@@ -20,7 +21,7 @@ from waiting import wait_until
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import deployments
 from flows.packages.publish import load_verified
-from flows.serving import registering
+from flows.serving import registering, watching
 from flows.serving.pools import read_pools
 from flows.serving.roots import SOURCES
 from flows.serving.server import Server
@@ -172,6 +173,18 @@ def ended(client: SyncPrefectClient, out: str) -> Any:
     runs = [run for run in client.read_flow_runs() if run.parameters.get("out") == out]
     over = (run for run in runs if run.state is not None and (run.state.is_completed() or run.state.is_failed()))
     return next(over, None)
+
+
+@pytest.mark.parametrize("missing", ["DEPLOYMENT", "TRIGGER"])
+def test_a_folder_is_not_watched_on_a_server_that_would_lose_its_files(
+    client: SyncPrefectClient, dg4d: Run, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    watching.check_registered()
+    monkeypatch.setattr(watching, missing, "catalog-to-4d/Nothing")
+    monkeypatch.setattr(watching.Watcher, "look", lambda *_: pytest.fail("it is watched"))
+    Path("in").mkdir()
+    done = dg4d("watch", "in", "-o", "out")
+    assert done.exit_code == 69 and "run `dg4d up` first" in done.stderr
 
 
 @pytest.mark.slow

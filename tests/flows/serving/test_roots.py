@@ -373,7 +373,8 @@ def test_what_a_killed_watcher_granted_ends_with_it(place: Path) -> None:
 
 
 def test_the_command_grants_what_it_watches(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flows.convert.connect", lambda: None)
+    for asks_a_server in ("flows.convert.connect", "flows.serving.watching.check_registered"):
+        monkeypatch.setattr(asks_a_server, lambda: None)
     seen: list[Roots] = []
 
     def look(*_: object) -> None:
