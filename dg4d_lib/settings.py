@@ -131,9 +131,6 @@ class Zero123PriorSettings(Settings):
         description="last entry of the pose conditioning; xl: difference of the radii; stable (Stable-Zero123):"
         " polar angle of the input camera",
     )
-    input_elevation_deg: float = Field(
-        0.0, ge=-80, le=80, description="elevation of the input camera; only for the variant stable"
-    )
     guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (paper's code: 5)")
     precision: Precision = Field("fp16", description="of the networks; always fp32 on CPUs")
     memory_gb: float = Field(
@@ -216,7 +213,7 @@ class SurfaceStartSettings(Settings):
 
 
 class LgmStartSettings(Settings):
-    """Gaussians by LGM from four views by ImageDream; the learning rate of their means is a tenth (public code)."""
+    """LGM: Gaussians from four views by ImageDream; the learning rate of their means is a tenth (public code)."""
 
     kind: Literal["lgm"] = "lgm"
     weights: str = Field("lgm", min_length=1, description="a name from `dg4d weights list`, a folder, or the file")
@@ -253,8 +250,8 @@ class FitSettings(Settings):
         0,
         ge=0,
         le=1024,
-        description="cameras that random views are drawn from, so that a prior with shapes draws each of them once per "
-        "frame; 0: new ones in every iteration (paper), as always for diffusion models",
+        description="cameras of random views; priors with a surface (geometric, learned) render each once per "
+        "frame and reuse the picture; 0: new ones in every iteration (paper), as always for diffusion models",
     )
     elevation_deg: float = Field(
         30.0, ge=0, le=80, description="random views have elevations within plus and minus this"

@@ -31,12 +31,14 @@ from dg4d_lib.settings import (
     Settings,
     StaticSettings,
     VideoToVideoSettings,
+    Zero123PriorSettings,
 )
 from dg4d_lib.weights.registry import lookup_weights
 from steps.catalog import STEPS
 from steps.contract import StepSpec, load_object, settings_errors, shown
 
 LARGEST_WHOLE = 2**53  # largest integer that every JSON reader represents exactly
+ZERO123_VARIANTS = {"zero123-xl": "xl", "stable-zero123": "stable"}  # by name in the registry
 CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
     "text.steps": "text.num_inference_steps",
     "text.guidance": "text.guidance_scale",
@@ -55,6 +57,8 @@ CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; remove
     "prior.turn_deg": "subject.turn_deg",
     "prior.coverage_weight": "",
     "prior.level": "",
+    "prior.input_elevation_deg": "",
+    "refiner.prior.input_elevation_deg": "",
     **{
         f"{stage}.{old}": f"{stage}.{new}"
         for stage in ("static", "motion")
@@ -116,6 +120,16 @@ class PipelineSettings(Settings):
                 raise ValueError(flow_matching_refusal(owner, name))
         return self
 
+    @model_validator(mode="after")
+    def _refuse_other_variants(self) -> Self:
+        """Refuse weights that the registry lists under the other variant of Zero-1-to-3."""
+        for owner, prior in (("prior", self.prior), ("refiner.prior", getattr(self.refiner, "prior", None))):
+            if isinstance(prior, Zero123PriorSettings):
+                name = lookup_weights(prior.weights).name
+                if ZERO123_VARIANTS.get(name, prior.variant) != prior.variant:
+                    raise ValueError(variant_refusal(owner, prior, ZERO123_VARIANTS[name]))
+        return self
+
     @model_validator(mode="before")
     @classmethod
     def _refuse_old_names(cls, given: Any) -> Any:
@@ -134,6 +148,14 @@ def flow_matching_refusal(owner: str, name: str) -> str:
         f"{owner}.weights = {name} is a flow-matching model: it generates views (views.weights) and videos "
         f"(driving.weights), but score distillation and refinement need one that predicts noise; use zero123-xl, "
         "stable-zero123 or imagedream for the prior, svd for the refiner"
+    )
+
+
+def variant_refusal(owner: str, prior: Zero123PriorSettings, variant: str) -> str:
+    """Return the sentence that refuses weights of another variant of Zero-1-to-3."""
+    return (
+        f"{owner}.variant = {prior.variant} does not fit {owner}.weights = {prior.weights}, which are of the variant "
+        f"{variant}; set {owner}.variant={variant}"
     )
 
 
@@ -229,7 +251,7 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
-        raise BadInput(f"settings refused: {settings_errors(error)}") from error
+        raise BadInput(f"settings refused: {settings_errors(error, tree)}") from error
 
 
 def _renamed(old: str, new: str) -> str:

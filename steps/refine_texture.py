@@ -19,6 +19,7 @@ from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
+from steps.fitting.priors import open_zero123
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
 
@@ -66,7 +67,7 @@ def _refine(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures],
             refiner, run_notes = VideoToVideo(kind, model, pictures[0]), model.notes
             method = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
         case ImageToImageSettings():
-            opened = open_weights(kind.prior.weights)
+            opened = open_zero123("refiner.prior", kind.prior)
             loaded = Zero123.load(opened.folder, kind.prior, device)
             prior = loaded.conditioned_on(pictures, TimestepSchedule(1.0))
             refiner, run_notes = ImageToImage(kind, prior), prior.batches.notes

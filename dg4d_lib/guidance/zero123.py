@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -206,8 +206,8 @@ class ConditionedZero123:
 
     def tokens(self, views: Sequence[GuidanceView]) -> Float[Tensor, "b 1 c"]:
         """Return the cross-attention token of every view, from its frame and relative pose."""
-        input_elevation = self.settings.input_elevation_deg if self.settings.variant == "stable" else None
-        poses = torch.stack([relative_pose(view.camera, self.input_camera, input_elevation) for view in views])
+        variant = self.settings.variant
+        poses = torch.stack([relative_pose(view.camera, self.input_camera, variant) for view in views])
         embeddings = self.embeddings[self._rows(views)]
         with torch.no_grad():
             poses = to_device_async(poses.to(embeddings.dtype), embeddings.device)
@@ -222,7 +222,7 @@ class ConditionedZero123:
 
 
 def relative_pose(
-    camera: OrbitCamera, input_camera: OrbitCamera, input_elevation_deg: float | None = None
+    camera: OrbitCamera, input_camera: OrbitCamera, variant: Literal["xl", "stable"] = "xl"
 ) -> Float[Tensor, " 4"]:
     """Return the relative pose in Zero-1-to-3's convention.
 
@@ -232,8 +232,8 @@ def relative_pose(
     Args:
         camera: of the novel view.
         input_camera: of the input image.
-        input_elevation_deg: for Stable-Zero123, whose last number is the polar angle of the input image; otherwise it
-            is the difference of the radii, world units.
+        variant: stable: the last number is the polar angle of the input camera, radians; xl: it is the difference of
+            the radii, world units.
 
     Returns:
         [polar difference in radians, sine and cosine of the azimuth difference, last number], float64.
@@ -241,6 +241,6 @@ def relative_pose(
     polar = math.radians(input_camera.elevation_deg - camera.elevation_deg)
     azimuth = math.radians(camera.azimuth_deg - input_camera.azimuth_deg)
     last = camera.radius - input_camera.radius
-    if input_elevation_deg is not None:
-        last = math.radians(90 - input_elevation_deg)
+    if variant == "stable":
+        last = math.radians(90 - input_camera.elevation_deg)
     return torch.tensor([polar, math.sin(azimuth), math.cos(azimuth), last], dtype=torch.float64)

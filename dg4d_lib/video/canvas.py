@@ -9,6 +9,7 @@ from dg4d_lib.images import over_white
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.framing import resample
 from dg4d_lib.video.matting import matte_from_first_alpha
+from dg4d_lib.video.soft_edges import free_colors
 
 MATTING_FAILED = (
     "The subject could not be separated from the background of a generated video; it keeps the outline of the input."
@@ -48,5 +49,5 @@ def cut_out(
         cutouts = matte_from_first_alpha(colors, subject[..., 3])
     except BadInput:
         notes = (MATTING_FAILED,)
-        cutouts = torch.cat([colors, subject[..., 3:].expand(len(colors), -1, -1, -1)], -1)
+        cutouts = torch.stack([free_colors(frame, subject[..., 3]) for frame in colors])
     return DrivingVideo(cutouts[..., :3], cutouts[..., 3:], fps), notes

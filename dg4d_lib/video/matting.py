@@ -121,17 +121,17 @@ def matte_from_first_alpha(frames: Float[Tensor, "t h w 3"], first: Float[Tensor
         first: alpha of the first frame.
 
     Returns:
-        Cut-outs with straight alpha.
+        Cut-outs with straight alpha; colors are free of the background.
 
     Raises:
         BadInput: no subject is found.
     """
-    cutouts = matte(frames).frames.clone()
-    cutouts[0] = torch.cat([frames[0], first[..., None]], -1)
+    alphas = matte(frames).frames[..., 3].clone()
+    alphas[0] = first
     weights = KEPT * torch.exp(-((frames[1:] - frames[:-1]).abs().amax(-1) / STILL).square())
     for i, weight in enumerate(weights, 1):
-        cutouts[i, ..., 3] = torch.lerp(cutouts[i, ..., 3], cutouts[i - 1, ..., 3], weight)
-    return cutouts
+        alphas[i] = torch.lerp(alphas[i], alphas[i - 1], weight)
+    return torch.stack([free_colors(frame, alpha) for frame, alpha in zip(frames, alphas, strict=True)])
 
 
 @dataclass(frozen=True)

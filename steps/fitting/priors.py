@@ -52,12 +52,12 @@ from dg4d_lib.visual_hull.frustum_field import known_field
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.visual_hull.shape import known_volume
 from dg4d_lib.visual_hull.surface import colored_surface
-from dg4d_lib.weights.registry import lookup_weights
+from dg4d_lib.weights.registry import KNOWN
 from steps.artifacts.archives import unpack
 from steps.artifacts.depth_fields import read_depth_field
 from steps.artifacts.media import read_png
 from steps.artifacts.pose import read_turn
-from steps.profiles import flow_matching_refusal
+from steps.profiles import flow_matching_refusal, variant_refusal
 from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
@@ -68,6 +68,7 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
+STABLE_UNET = KNOWN["stable-zero123"].published["unet/diffusion_pytorch_model.safetensors"]  # sha256
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
 
 
@@ -176,14 +177,11 @@ def make_prior(
                 raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
             return LoadedPrior(make_oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
         case Zero123PriorSettings():
-            check_variant(settings)
-            opened = open_weights(settings.weights)
-            check_predicts_noise(opened.folder, settings.weights)
+            opened = open_zero123("prior", settings)
             known = Zero123.load(opened.folder, settings, default_device()).conditioned_on(_pictures(cutouts), noise)
             return LoadedPrior(known, f"prior: Zero-1-to-3, weights {settings.weights}", opened, known.batches)
         case ImageDreamPriorSettings():
-            opened = open_weights(settings.weights)
-            check_predicts_noise(opened.folder, settings.weights)
+            opened = _open_noise_predictor("prior", settings.weights)
             model = ImageDream.load(opened.folder, settings.precision, default_device())
             dream = ImageDreamPrior(model, model.conditioned_on(_pictures(cutouts)), noise, settings)
             return LoadedPrior(dream, f"prior: ImageDream, weights {settings.weights}", opened, dream.batches)
@@ -331,28 +329,29 @@ def _pictures(cutouts: Sequence[Float[Tensor, "h w 4"]]) -> Float[Tensor, "t h w
     return over_white(torch.stack(list(cutouts)))
 
 
-def check_predicts_noise(folder: Path, name: str) -> None:
-    """Refuse a folder with a model of flow matching, which is no critic of score distillation.
+def open_zero123(owner: str, settings: Zero123PriorSettings) -> LocatedWeights:
+    """Return installed weights of Zero-1-to-3; a copy of Stable-Zero123 is known by the digest of its UNet.
+
+    Args:
+        owner: section of the settings, for messages.
+        settings: name and variant of the weights.
 
     Raises:
-        BadInput: says what it can be used for, and which weights can be a prior.
+        BadInput: a model of flow matching, Stable-Zero123 as another variant, or an unknown name.
+        BackendUnavailable: the weights are not installed.
     """
-    if is_flow_matching(folder):
-        raise BadInput(flow_matching_refusal("prior", name))
+    opened = _open_noise_predictor(owner, settings.weights)
+    if f"sha256:{STABLE_UNET}" in opened.digests.values() and settings.variant != "stable":
+        raise BadInput(variant_refusal(owner, settings, "stable"))
+    return opened
 
 
-def check_variant(settings: Zero123PriorSettings) -> None:
-    """Refuse weights that the registry lists under the other variant.
-
-    Raises:
-        BadInput: says how to set it right.
-    """
-    known = {"zero123-xl": "xl", "stable-zero123": "stable"}
-    name = lookup_weights(settings.weights).name
-    if known.get(name, settings.variant) != settings.variant:
-        raise BadInput(
-            f"prior.variant = {settings.variant} does not fit the weights {name}; set prior.variant={known[name]}"
-        )
+def _open_noise_predictor(owner: str, name: str) -> LocatedWeights:
+    """Return installed weights; refuse models of flow matching, which are no critics of score distillation."""
+    opened = open_weights(name)
+    if is_flow_matching(opened.folder):
+        raise BadInput(flow_matching_refusal(owner, name))
+    return opened
 
 
 def read_known_views(path: Path | None, scratch: Path) -> Bank | None:

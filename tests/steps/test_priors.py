@@ -1,3 +1,4 @@
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -108,13 +109,13 @@ def test_that_memory_ran_out_is_said_of_the_run_and_of_nothing_else(model: Path)
     assert "memory ran out with 16 views" in choice.report("cpu").run_notes[0]
 
 
-@pytest.mark.parametrize(
-    ("weights", "variant"), [("stable-zero123", "xl"), ("ashawkey/zero123-xl-diffusers", "stable")]
-)
-def test_known_weights_with_the_wrong_cameras_are_refused(weights: str, variant: str) -> None:
-    settings = Zero123PriorSettings.model_validate({"weights": weights, "variant": variant})
-    with pytest.raises(BadInput, match=r"set prior\.variant="):
-        make_prior(settings, CUTOUTS[:1], StaticSettings(), None, Path())
+def test_a_copy_of_stable_zero123_is_known_by_its_digest(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unet = hashlib.sha256((model / "unet" / "diffusion_pytorch_model.safetensors").read_bytes()).hexdigest()
+    monkeypatch.setattr(priors, "STABLE_UNET", unet)
+    with pytest.raises(BadInput, match=r"of the variant stable; set prior\.variant=stable"):
+        chosen(model, StaticSettings(), CUTOUTS[:1])
+    stable = Zero123PriorSettings(weights=str(model), variant="stable")
+    assert make_prior(stable, CUTOUTS[:1], StaticSettings(), None, model).opened
 
 
 def test_weights_that_are_not_here_are_named_with_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -22,6 +22,13 @@ def test_a_request_says_what_will_draw(lack: str, backend: str, monkeypatch: pyt
             assert made.model_dump(mode="json")["rasterizer"] == draws
 
 
+@pytest.mark.parametrize("name", ["driving.motion", "prior.weight", "static.start.points", "refiner.texture.lr"])
+def test_a_refused_setting_has_its_own_name(name: str) -> None:
+    kinds = {"static.start.kind": "blob", "refiner.kind": "video_to_video"}
+    with pytest.raises(BadInput, match=rf"refused: {re.escape(name)} = 'walk'"):
+        revise(PREVIEW, {**kinds, name: "walk"})
+
+
 PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.98, "static.t_max_end": 0.02,
          "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
          "static.t_max_limit": 0.98, "motion.t_max_limit": 0.98, "motion.guidance_weight": 1.0,
@@ -86,9 +93,27 @@ def test_open_names_weights_that_may_be_sold_and_no_others() -> None:
 )
 def test_a_flow_matching_model_is_no_critic(changes: dict[str, str], owner: str) -> None:
     with pytest.raises(
-        BadInput, match=rf"{re.escape(owner)} = .* is a flow-matching model: it generates views .*zero123-xl"
+        BadInput,
+        match=rf"refused: Value error, {re.escape(owner)} = .* is a flow-matching model: it .*zero123-xl",
     ):
         revise(PREVIEW, changes)
+
+
+@pytest.mark.parametrize(
+    ("owner", "kind"),
+    [("prior", {"prior.kind": "zero123"}), ("refiner.prior", {"refiner.kind": "image_to_image"})],
+)
+@pytest.mark.parametrize(
+    ("weights", "variant", "right"),
+    [("stable-zero123", "xl", "stable"), ("ashawkey/zero123-xl-diffusers", "stable", "xl")],
+)
+def test_known_weights_with_the_wrong_cameras_are_refused(
+    owner: str, kind: dict[str, str], weights: str, variant: str, right: str
+) -> None:
+    changes = kind | {f"{owner}.weights": weights}
+    with pytest.raises(BadInput, match=rf"set {owner}\.variant={right}"):
+        revise(PREVIEW, changes | {f"{owner}.variant": variant})
+    revise(PREVIEW, changes | {f"{owner}.variant": right})
 
 
 def test_the_scale_of_lgm_is_that_of_the_library() -> None:

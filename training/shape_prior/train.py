@@ -266,7 +266,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _on_cpu(value: Any) -> Any:
-    """Return nested dicts and lists with every tensor on the processor, so that a checkpoint needs no GPU to be read."""
+    """Return nested dicts and lists with every tensor on the processor: a checkpoint is read without a GPU."""
     if isinstance(value, Tensor):
         return value.cpu()
     if isinstance(value, dict):

@@ -69,9 +69,12 @@ def judged(
 
 
 def by_the_formulas(
-    z: Zero123, frames: torch.Tensor, images: torch.Tensor, timestep: int, last: float | None
+    z: Zero123, frames: torch.Tensor, images: torch.Tensor, timestep: int, polar: float | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return loss and gradient of SDS written out per image, with the networks of the product."""
+    """Return loss and gradient of SDS written out per image, with the networks of the product.
+
+    `polar` is the angle of the input camera from the pole, which Stable-Zero123 is told.
+    """
     beta = torch.linspace(math.sqrt(0.00085), math.sqrt(0.012), 1000, dtype=torch.float64) ** 2
     alphabar = torch.cumprod(1 - beta, 0)[timestep]
     noise = torch.randn((len(images), 4, 32, 32), generator=seeded(), dtype=images.dtype)
@@ -87,8 +90,9 @@ def by_the_formulas(
         small = functional.interpolate(frame, (256, 256), mode="bilinear", antialias=True, align_corners=False)
         v = z.vae.encode(small * 2 - 1).latent_dist.mean
         azimuth = math.radians(view.camera.azimuth_deg)
-        fourth = view.camera.radius - 2.0 if last is None else last
-        camera = [-math.radians(view.camera.elevation_deg), math.sin(azimuth), math.cos(azimuth), fourth]
+        fourth = view.camera.radius - 2.0 if polar is None else polar
+        moved = math.radians(90 - view.camera.elevation_deg) - (math.pi / 2 if polar is None else polar)
+        camera = [moved, math.sin(azimuth), math.cos(azimuth), fourth]
         w, b = z.camera_projection.weight, z.camera_projection.bias
         token = (w @ torch.cat([c[0], torch.tensor(camera, dtype=torch.float64)]) + b)[None, None]
 
@@ -111,7 +115,7 @@ def by_the_formulas(
 def test_loss_and_gradient_are_those_of_the_formulas(exact: Zero123, progress: float, timestep: int) -> None:
     frames, images = pictures(2, 120, torch.float64), pictures(3, 96, torch.float64, seed=6)
     loss, gradient = judged(exact.conditioned_on(frames, PAPER), images, progress=progress)
-    expected, slope = by_the_formulas(exact, frames, images, timestep, last=None)
+    expected, slope = by_the_formulas(exact, frames, images, timestep)
     torch.testing.assert_close(loss, expected, rtol=1e-9, atol=0)
     torch.testing.assert_close(gradient, slope, rtol=1e-7, atol=1e-12)
 
@@ -131,10 +135,10 @@ def test_single_precision_loses_few_digits(networks: Zero123, exact: Zero123) ->
 
 def test_stable_zero123_is_told_the_angle_of_the_input_from_the_pole(exact: Zero123) -> None:
     frames, images = pictures(2, 120, torch.float64), pictures(3, 96, torch.float64, seed=6)
-    settings = Zero123PriorSettings(variant="stable", input_elevation_deg=25)
-    prior = dataclasses.replace(exact, settings=settings).conditioned_on(frames, PAPER)
+    stable = dataclasses.replace(exact, settings=Zero123PriorSettings(variant="stable"))
+    prior = stable.conditioned_on(frames, PAPER, OrbitCamera(elevation_deg=25))
     loss, _ = judged(prior, images)
-    expected, _ = by_the_formulas(exact, frames, images, 500, last=math.radians(65))
+    expected, _ = by_the_formulas(exact, frames, images, 500, polar=math.radians(65))
     torch.testing.assert_close(loss, expected, rtol=1e-9, atol=0)
 
 
@@ -179,7 +183,7 @@ def test_a_camera_that_moves_to_the_right_grows_in_azimuth() -> None:
 def test_the_input_view_is_no_move_wherever_it_was_taken() -> None:
     camera = OrbitCamera(17, 40, 1.5)
     assert relative_pose(camera, camera).tolist() == [0, 0, 1, 0]
-    assert relative_pose(camera, camera, 17.0)[3] == pytest.approx(math.radians(73))
+    assert relative_pose(camera, camera, "stable")[3] == pytest.approx(math.radians(73))
 
 
 def test_the_token_is_the_projection_of_embedding_and_camera(networks: Zero123) -> None:

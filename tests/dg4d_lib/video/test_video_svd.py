@@ -4,8 +4,11 @@ from tiny_svd import save_tiny_svd
 from torch import Tensor
 
 from dg4d_lib.diffusion.video_model import VideoCondition, VideoModel
+from dg4d_lib.images import over_white
 from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.settings import VideoModelSettings
+from dg4d_lib.video import matting
+from dg4d_lib.video.canvas import cut_out
 from dg4d_lib.video.svd import StableVideo
 
 pytestmark = pytest.mark.usefixtures("quick_segmentation")
@@ -101,3 +104,19 @@ def test_where_nothing_can_be_told_the_outline_stays_and_it_is_said(model: Video
     video = maker.generate(subject, rng(0))
     assert torch.equal(video.alpha, subject[..., 3:].expand(FRAMES, -1, -1, -1))
     assert any("keeps the outline" in note for note in maker.notes)
+
+
+@pytest.mark.parametrize(("shift", "matted"), [(0, True), (2, True), (0, False)])
+def test_cut_outs_over_white_are_the_generated_frames(
+    shift: int, matted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Colors along the outline must be free of white, or they are mixed with it twice."""
+    if not matted:
+        monkeypatch.setattr(matting, "MIN_AREA", 1.0)  # no subject is large enough
+    discs = torch.stack([disc(shift * i) for i in range(FRAMES)])
+    frames = over_white(discs)
+    video, notes = cut_out(frames, discs[0], fps=7.0)
+    assert bool(notes) != matted
+    soft = (discs[..., 3] > 0.02) & (discs[..., 3] < 0.98)
+    error = (video.over(torch.ones(3)) - frames).abs().mean(-1)
+    assert all(error[i][soft[i]].mean() < 0.01 for i in range(FRAMES))
