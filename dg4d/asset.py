@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from trimesh import Trimesh
 
-    from dg4d_lib.assets.placement import Surface
+    from dg4d_lib.assets.placement import Placement, Surface
     from dg4d_lib.cameras.orbit import OrbitCamera
     from dg4d_lib.gaussians.cloud import Gaussians
     from steps.artifacts.packages import Manifest
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 REPORT = "report.json"
 FRAME_HEIGHT = 520  # pixels of the viewer in a notebook
+ROUNDING = 1e-6  # frames by which a time counts as that of a frame
 
 
 def load(package: str | Path) -> "Asset":
@@ -119,7 +120,7 @@ class Asset:
         return failing_gates(self.folder)
 
     def mesh(self, t: float = 0.0) -> "Trimesh":
-        """Return the textured mesh at a time, y up."""
+        """Return the textured mesh at a time, in meters and y up, as in the files of the package."""
         import trimesh
         from PIL import Image
 
@@ -130,11 +131,15 @@ class Asset:
         uvs = found.uvs.numpy().copy()
         uvs[:, 1] = 1 - uvs[:, 1]  # trimesh counts rows of a texture from the bottom
         visual = trimesh.visual.TextureVisuals(uv=uvs, image=Image.fromarray(pixels))
-        return trimesh.Trimesh(found.vertices.numpy(), found.faces.numpy(), visual=visual, process=False)
+        vertices = self._placement.points(found.vertices).numpy()
+        return trimesh.Trimesh(vertices, found.faces.numpy(), visual=visual, process=False)
 
     def gaussians(self, t: float = 0.0) -> "Gaussians":
-        """Return the Gaussians at a time: means, scales, rotations, opacities and colors as torch tensors."""
-        return self._states(self._position(t)).at(0)
+        """Return the Gaussians at a time, in the coordinates of `mesh`.
+
+        They have means, scales, rotations, opacities and colors as torch tensors.
+        """
+        return self._placement.gaussians(self._states(self._position(t)).at(0))
 
     def render(
         self, camera: "OrbitCamera | None" = None, t: float = 0.0, *, mesh: bool = False
@@ -142,7 +147,8 @@ class Asset:
         """Render the asset as an RGBA picture in [0, 1] with straight alpha, shape (height, width, 4).
 
         Args:
-            camera: pose, field of view and size; None: the camera of the input picture, 256 pixels.
+            camera: pose, field of view and size; it looks at the middle of the input picture, from a distance in units
+                of the fit, whatever the height of the asset. None: the camera of the input picture, 256 pixels.
             t: time in seconds.
             mesh: render the textured mesh instead of the Gaussians.
         """
@@ -188,7 +194,15 @@ class Asset:
 
         if not math.isfinite(t):
             raise BadInput(f"the time is {t}; give seconds, for example 0.5")
-        return torch.tensor([(t * self.fps) % self.frames], dtype=torch.float64)
+        frame = t * self.fps
+        if abs(frame - round(frame)) < ROUNDING:
+            frame = round(frame)
+        return torch.tensor([frame % self.frames], dtype=torch.float64)
+
+    @property
+    def _placement(self) -> "Placement":
+        """Map from the coordinates of the fit, which `steps.artifacts.rendering` reads, to meters."""
+        return self.manifest.placement.placement
 
     @cached_property
     def _states(self) -> "States":

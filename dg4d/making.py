@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union
 
+from pydantic import ValidationError
+
 from dg4d.asset import Asset, load
 from dg4d.progress import OnProgress, reporting
 from dg4d_lib.errors import BadInput, DG4DError
@@ -19,8 +21,10 @@ from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.setting_reference import check_names
 from flows.packages.publish import check_folder, is_current
 from flows.step_errors import StepError
+from steps.contract import settings_errors
 from steps.profiles import profile as named_profile
 from steps.profiles import revise
+from steps.sources.views import HIGHEST_DEG
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 
 if TYPE_CHECKING:
@@ -33,6 +37,7 @@ ENGINES = ("inline", "prefect")
 Picture = Union[str, Path, "Image.Image", "NDArray[np.generic]"]
 Views = Mapping[float | tuple[float, float], str | Path]  # azimuth, or azimuth and elevation, in degrees
 CHANNELS = (3, 4)
+PNG_MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")  # of PIL images
 FAILURES = (DG4DError, StepError, ArtifactMissing, StoreUnreachable, OSError)  # of one item of a batch
 
 
@@ -105,7 +110,7 @@ def make(
         StepError: a step failed; the output folder is as it was.
     """
     with _as_file(picture) as path:
-        request = ConversionRequest(
+        request = _request(
             item=name or _name_of(picture, asset, video, text),
             picture=path,
             text=text,
@@ -160,6 +165,8 @@ def batch(
     Raises:
         BadInput: the inputs or the settings cannot be used at all.
     """
+    if workers < 1:
+        raise BadInput(f"workers is {workers}; at least 1 is needed")
     out, changes = Path(out), flat_settings(settings)
     with _items(pictures, out, profile, changes, seed) as items:
 
@@ -193,6 +200,18 @@ def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, An
     if not prefix:
         check_names(flat)
     return flat
+
+
+def _request(**fields: Any) -> ConversionRequest:
+    """Return a checked request.
+
+    Raises:
+        BadInput: a field has a wrong type or value.
+    """
+    try:
+        return ConversionRequest(**fields)
+    except ValidationError as error:
+        raise BadInput(settings_errors(error)) from error
 
 
 def _convert(
@@ -256,9 +275,7 @@ def _items(
             raise BadInput("the batch is empty; give one picture or more")
         names = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in paths])
         yield [
-            Item(
-                name=name, request=ConversionRequest(item=name, picture=path, profile=profile, settings=base, seed=seed)
-            )
+            Item(name=name, request=_request(item=name, picture=path, profile=profile, settings=base, seed=seed))
             for name, path in zip(names, paths, strict=True)
         ]
 
@@ -280,11 +297,12 @@ def _written(picture: Any, folder: Path, stem: str) -> Path:
         BadInput: it is neither, or has another shape or type.
     """
     import numpy as np
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     if not isinstance(picture, Image.Image):
         pixels = np.asarray(picture)
-        if pixels.ndim != 3 or pixels.shape[2] not in CHANNELS or pixels.dtype.kind not in "uf":
+        is_picture = pixels.ndim == 3 and pixels.size and pixels.shape[2] in CHANNELS
+        if not is_picture or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
             raise BadInput(
                 f"a picture in memory is a PIL image or an array of shape (height, width, 3 or 4), uint8 or float in "
                 f"[0, 1]; given {type(picture).__name__} of shape {pixels.shape} and type {pixels.dtype}"
@@ -292,6 +310,9 @@ def _written(picture: Any, folder: Path, stem: str) -> Path:
         if pixels.dtype.kind == "f":
             pixels = (np.nan_to_num(pixels).clip(0, 1) * 255).round()
         picture = Image.fromarray(pixels.astype(np.uint8))
+    picture = ImageOps.exif_transpose(picture)  # as in files
+    if picture.mode not in PNG_MODES:
+        picture = picture.convert("RGBA" if picture.mode == "RGBa" else "RGB")
     folder.mkdir(parents=True, exist_ok=True)
     picture.save(folder / f"{stem}.png")
     return folder / f"{stem}.png"
@@ -306,4 +327,9 @@ def _name_of(picture: Picture | None, asset: str | Path | None, video: str | Pat
 
 def _view_file(place: float | tuple[float, float], path: str | Path) -> ViewFile:
     azimuth, elevation = place if isinstance(place, tuple) else (place, 0.0)
+    if not (-360 <= azimuth <= 360 and -HIGHEST_DEG <= elevation <= HIGHEST_DEG):
+        raise BadInput(
+            f"the direction {place} of the view {path} is out of range; azimuths are -360 to 360 degrees, elevations "
+            f"-{HIGHEST_DEG:g} to {HIGHEST_DEG:g}"
+        )
     return ViewFile(azimuth=azimuth, elevation=elevation, path=Path(path))

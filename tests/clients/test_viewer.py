@@ -209,6 +209,20 @@ def test_frames_with_meshes_of_their_own_are_shown_one_at_a_time(tried: Try) -> 
         assert overlap(page.pictures[mode, time][..., 3], coverage[0, ..., 0].numpy()) > 0.95
 
 
+def test_the_time_of_a_frame_shows_that_frame(tried: Try) -> None:
+    """Times of keys have the precision of float32: 0.1 is later there than in the page."""
+    mesh, fps, frames = ball(), 10.0, 8
+    moved = [replace(mesh, texture=torch.full_like(mesh.texture, k / (frames - 1))) for k in range(frames)]
+    times = [k / fps for k in range(frames)]
+    page = tried(
+        write_frames_glb(moved, fps, settings=GltfSettings(image="png")), shots=tuple(("mesh", t) for t in times)
+    )
+    for k, time in enumerate(times):
+        picture = page.pictures["mesh", time]
+        middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
+        np.testing.assert_allclose(middle[:3], k / (frames - 1), atol=0.02)
+
+
 def test_a_texture_that_changes_is_seen_to_change(tried: Try) -> None:
     colors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
     asset = replace(egg(), textures=colors[:, None, None].expand(FRAMES, 16, 16, 3))

@@ -10,10 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from recording import add_record
 
 import dg4d
+from dg4d.asset import Asset
 from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.ply import read_ply
+from steps.artifacts.packages import Manifest
 from tests.steps.small_package import FPS, FRAMES, REACH, cloud, packed, tracked
 
 
@@ -35,6 +39,23 @@ def test_the_mesh_moves_and_the_loop_closes(gem: Path) -> None:
         np.testing.assert_allclose(asset.mesh(t).vertices, first.vertices, atol=1e-3)
 
 
+def test_meshes_and_gaussians_are_where_the_files_have_them(gem: Path) -> None:
+    asset = dg4d.load(gem)
+    np.testing.assert_allclose(asset.mesh().bounds, trimesh.load_scene(gem / "asset.glb").bounds, atol=1e-3)
+    assert asset.mesh().bounds[0, 1] == pytest.approx(0, abs=1e-3)  # on the ground
+    splats = read_ply(gem / "splats" / "000.ply", y_down=True)
+    torch.testing.assert_close(asset.gaussians().means, splats.means, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("frames", "fps"), [(29, 25.0), (61, 29.97), (14, 10.0)])
+def test_the_time_of_a_frame_is_that_frame(frames: int, fps: float) -> None:
+    asset = object.__new__(Asset)
+    asset.manifest = Manifest.model_construct(frames=frames, fps=fps)
+    positions = [float(asset._position(frame / fps)) for frame in range(3 * frames)]
+    assert positions == [frame % frames for frame in range(3 * frames)]
+    assert float(asset._position(0.3 - 0.1 * 3)) == 0  # not `frames`, of which there is no mesh
+
+
 def test_the_texture_is_where_trimesh_looks_for_it(gem: Path) -> None:
     mesh = dg4d.load(gem).mesh()
     colors = mesh.visual.to_color().vertex_colors[:, :3] / 255
@@ -53,7 +74,8 @@ def test_the_gaussians_move_with_the_asset(gem: Path) -> None:
     asset = dg4d.load(gem)
     for frame in range(FRAMES):
         moved = asset.gaussians(frame / FPS)
-        expected = cloud().means + torch.tensor([REACH * frame / (FRAMES - 1), 0, 0])
+        shift = torch.tensor([REACH * frame / (FRAMES - 1), 0, 0])
+        expected = asset.manifest.placement.placement.points(cloud().means + shift)
         assert len(moved) == 9
         torch.testing.assert_close(moved.means, expected, atol=1e-3, rtol=0)
 

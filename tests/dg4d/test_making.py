@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import threading
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,10 @@ def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
         ({"engine": "steam"}, "inline, prefect"),
         ({"profile": "perfect"}, "choose one of"),
         ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed = 1.5"),
+        ({"views": {450: "fox.png"}}, "450 .* out of range"),
+        ({"views": {(90, 89): "fox.png"}}, "out of range"),
+        ({"views": {math.nan: "fox.png"}}, "out of range"),
         ({"views": {90: "none.png"}}, "none.png"),
         ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
         ({"asset": "none.glb"}, "none.glb"),
@@ -112,7 +117,35 @@ def test_a_picture_in_memory_is_taken(given: Any, monkeypatch: pytest.MonkeyPatc
     assert (job.item, folder) == ("drawn", Path("out/drawn"))
 
 
-@pytest.mark.parametrize("given", [np.zeros((4, 4)), np.zeros((4, 4, 2)), np.full((4, 4, 3), "a"), object()])
+def written_size(given: Image.Image, folder: Path) -> tuple[int, int]:
+    with Image.open(making._written(given, folder, "x")) as found:
+        return found.size
+
+
+@pytest.mark.parametrize("mode", ["L", "CMYK", "YCbCr", "LAB", "F", "I", "I;16", "RGBa", "RGBX", "P", "1"])
+def test_pictures_of_every_mode_are_written(mode: str, tmp_path: Path) -> None:
+    assert written_size(Image.new(mode, (6, 4)), tmp_path) == (6, 4)
+
+
+def test_a_picture_in_memory_is_turned_upright(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # orientation
+    Image.new("RGB", (8, 4)).save(tmp_path / "phone.jpg", exif=exif)
+    with Image.open(tmp_path / "phone.jpg") as phone:
+        assert written_size(phone, tmp_path) == (4, 8)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.zeros((4, 4)),
+        np.zeros((4, 4, 2)),
+        np.zeros((0, 4, 3)),
+        np.zeros((4, 4, 3), np.uint16),
+        np.full((4, 4, 3), "a"),
+        object(),
+    ],
+)
 def test_other_things_in_memory_are_refused(given: Any) -> None:
     with pytest.raises(BadInput, match="PIL image or an array"):
         dg4d.make(given)

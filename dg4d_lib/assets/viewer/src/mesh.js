@@ -7,6 +7,7 @@ import { pointersOf } from "./pointers.js";
 
 const CLAY = { color: 0xc9ced8, side: DoubleSide, flatShading: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
 const EDGES = { color: 0x1f3a7a, wireframe: true, transparent: true, opacity: 0.38 };
+const EARLY = 2e-5; // seconds: keys have the precision of float32, so that of a frame may lie after the frame's time
 
 /** Parses a GLB; its first animation is played. */
 export async function readMesh(bytes) {
@@ -47,7 +48,7 @@ class AnimatedMesh {
   }
 
   seek(seconds) {
-    const time = this.duration > 0 ? seconds % this.duration : 0;
+    const time = this.duration > 0 ? (seconds + EARLY) % this.duration : 0;
     this.mixer.setTime(time);
     this.pointers.seek(time);
     this.morphs.forEach((morph) => morph.update());
