@@ -136,9 +136,11 @@ def run(job: Job) -> StepReport:
 def compare(ours: ViewFrames, theirs: ViewFrames, networks: MetricNetworks) -> Metrics:
     """Compute every metric of one view as means over frames; those over time need two frames."""
     foreground = ((ours.alpha > FOREGROUND) | (theirs.alpha > FOREGROUND)).float()
+    shown = foreground.amax((1, 2, 3)) > 0
+    shown |= ~shown.any()  # all frames if none shows a subject
     metrics = {
         "psnr": float(psnr(ours.color, theirs.color).mean()),
-        "psnr_obj": float(psnr(ours.color, theirs.color, foreground).mean()),
+        "psnr_obj": float(psnr(ours.color[shown], theirs.color[shown], foreground[shown]).mean()),
         "ssim": float(ssim(ours.color, theirs.color).mean()),
         "iou": float(iou(ours.alpha, theirs.alpha, FOREGROUND).mean()),
     }

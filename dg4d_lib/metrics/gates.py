@@ -137,7 +137,7 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
     return [
         Gate(
             "fidelity",
-            {form: float(fidelity(images, video).mean()) for form, images in input_views.items()},
+            {form: float(_of_shown(fidelity(images, video), images, video)) for form, images in input_views.items()},
             settings.fidelity_least,
             None,
             "dB",
@@ -233,6 +233,12 @@ def fidelity(images: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:
     """Return the PSNR in dB over the union of the silhouettes."""
     region = torch.maximum(images.alpha, video.alpha) > SUBJECT_ALPHA
     return psnr(images.color, video.color, region.to(video.alpha))
+
+
+def _of_shown(values: Float[Tensor, " b"], images: RgbaImages, video: RgbaImages) -> Float[Tensor, ""]:
+    """Return the mean over the frames that show a subject; over all if none does."""
+    shown = torch.maximum(images.alpha, video.alpha).amax((1, 2, 3)) > SUBJECT_ALPHA
+    return values[shown].mean() if shown.any() else values.mean()
 
 
 def flicker(images: RgbaImages, video: RgbaImages) -> float:

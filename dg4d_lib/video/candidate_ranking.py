@@ -136,7 +136,7 @@ def _shown(cutouts: Float[Tensor, "t s s 4"], reference: Float[Tensor, "1 s s 4"
     """Mark frames that show a subject bright enough to be seen."""
     area, expected = cutouts[..., 3].mean((1, 2)), reference[..., 3].mean()
     brightness = cutouts[..., :3].mean((1, 2, 3)) / area.clamp_min(1e-6)
-    return (area > 0.1 * expected) & (brightness > DARK * reference[..., :3].mean() / expected)
+    return (area > 0.1 * expected) & (brightness >= DARK * reference[..., :3].mean() / expected)
 
 
 def _repeated(pictures: Float[Tensor, "t s s 3"]) -> Tensor:

@@ -49,7 +49,7 @@ def render_package(
         azimuths_deg: azimuths of the cameras.
         elevation_deg: elevation of the cameras, -90 to 90.
         size: pixels of a side, 16 to 4096.
-        frames: number of pictures, evenly spaced from the first to the last frame; None: one per frame.
+        frames: number of pictures, evenly spaced from the first to the last frame of the fit; None: one per frame.
         mesh: render the textured mesh instead of the splats.
         out: folder, made if necessary; pictures of the same name are replaced.
         progress: callback (pictures done, total).
@@ -69,7 +69,8 @@ def render_package(
         draw = mesh_renderer(read_surface(folder, manifest))
     else:
         draw = splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
-    positions = frame_positions(manifest.frames if frames is None else frames, manifest)
+    every = torch.arange(manifest.frames, dtype=torch.float64)
+    positions = every if frames is None else fitted_positions(frames, folder, manifest)
     count = len(positions)
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
     for number, (view, azimuth_deg) in enumerate(zip(views, azimuths_deg, strict=True)):
@@ -83,9 +84,14 @@ def render_package(
     return views
 
 
-def frame_positions(count: int, manifest: Manifest) -> Float[Tensor, " n"]:
-    """Return evenly spaced positions from the first to the last frame, in frames."""
-    return torch.arange(count, dtype=torch.float64) * (manifest.frames - 1) / max(1, count - 1)
+def fitted_positions(count: int, folder: Path, manifest: Manifest) -> Float[Tensor, " n"]:
+    """Return evenly spaced positions from the first to the last frame of the fit, in frames of the package.
+
+    The last frames of a package with another frame rate than the fit (`pack.fps`) lead back to the first.
+    """
+    fitted = read_compact(folder / COMPACT).frames if (folder / COMPACT).is_file() else manifest.frames
+    last = (fitted - 1) * manifest.frames / fitted
+    return torch.arange(count, dtype=torch.float64) * last / max(1, count - 1)
 
 
 def read_states(folder: Path, manifest: Manifest) -> States:

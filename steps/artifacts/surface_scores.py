@@ -16,7 +16,7 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.metrics.actionbench import align_points, chamfer_3d, chamfer_4d, chamfer_motion, unit_box
 from dg4d_lib.metrics.surface import align_bounding_boxes, chamfer_distance, place_points, sample_surface
 from steps.artifacts.packages import read_manifest
-from steps.artifacts.rendering import frame_positions, mesh_at, read_surface
+from steps.artifacts.rendering import fitted_positions, mesh_at, read_surface
 
 UNTRACKED = "CD-M follows points of one mesh; this asset has a mesh per frame (mesh.mode=tracked makes one)"
 
@@ -102,5 +102,5 @@ def _meshes(package: Path, frames: int) -> tuple[list[TexturedMesh], bool]:
     """Return the mesh at evenly spaced times, and whether all have the same triangles."""
     manifest = read_manifest(package)
     surface = read_surface(package, manifest)
-    meshes = [mesh_at(surface, position) for position in frame_positions(frames, manifest)]
+    meshes = [mesh_at(surface, position) for position in fitted_positions(frames, package, manifest)]
     return meshes, isinstance(surface, Asset4D)

@@ -6,7 +6,7 @@ from shutil import copytree, rmtree
 
 import pytest
 import torch
-from small_package import BLUE, FRAMES, REACH, packed
+from small_package import BLUE, FPS, FRAMES, REACH, packed
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -79,6 +79,14 @@ def test_other_numbers_of_frames_are_spread_from_first_to_last(package: Path, tm
     (view,) = render(package, tmp_path, frames=5, mesh=mesh)
     seen = [column(picture) for picture in pictures(view)]
     assert seen == pytest.approx([expected_column(0, share) for share in (0, 0.25, 0.5, 0.75, 1)], abs=0.5)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_frames_of_another_rate_are_spread_over_the_fit(tmp_path: Path, mesh: bool) -> None:
+    """The last states of a resampled package lead back to its first frame."""
+    (view,) = render(packed(tmp_path, fps=4 * FPS), tmp_path / "views", frames=FRAMES, mesh=mesh)
+    seen = [column(picture) for picture in pictures(view)]
+    assert seen == pytest.approx([expected_column(0, share) for share in (0, 0.5, 1)], abs=0.5)
 
 
 def test_one_frame_is_the_first(package: Path, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def silhouette_iou(
         rendered = rasterize_mesh(vertices, faces, cameras).faces >= 0
         expected = silhouettes[:, view]
         intersection, union = (mask.flatten(1).sum(1) for mask in (rendered & expected, rendered | expected))
-        total += VIEWS[view][1] * (intersection / union.clamp(min=1)).cpu()
+        total += VIEWS[view][1] * torch.where(union > 0, intersection / union.clamp(min=1), 1.0).cpu()
         weights += VIEWS[view][1]
     return total / weights
 

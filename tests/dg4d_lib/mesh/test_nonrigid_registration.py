@@ -5,8 +5,9 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface
-from dg4d_lib.mesh.extraction.silhouettes import render_silhouettes, silhouette_iou
+from dg4d_lib.mesh.extraction.silhouettes import cameras_of, render_silhouettes, silhouette_iou
 from dg4d_lib.mesh.tracking.nonrigid_registration import MIN_IOU, register_nonrigid
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
@@ -45,3 +46,12 @@ def test_vertices_that_were_left_behind_come_to_the_outlines_and_others_stay():
     aim = trimesh.Trimesh(*extract_surface(density_field(stretched, SETTINGS), LEVEL), process=False)
     assert moved.is_watertight
     assert abs(moved.extents / aim.extents - 1).max() < 0.1
+
+
+def test_a_mesh_agrees_with_itself_outside_of_the_picture():
+    mesh = trimesh.creation.icosphere(2, 0.3)
+    faces = torch.from_numpy(mesh.faces.astype("int32"))
+    vertices = torch.from_numpy(mesh.vertices).float() + torch.tensor([[[0.0, 0, 0]], [[9.0, 0, 0]]])
+    views = [rasterize_mesh(vertices, faces, cameras).faces >= 0 for cameras in cameras_of(2)]
+    assert views[0][0].any() and not views[0][1].any()
+    assert silhouette_iou(vertices, faces, torch.stack(views, 1)).tolist() == [1, 1]

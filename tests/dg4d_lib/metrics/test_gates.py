@@ -144,6 +144,16 @@ def test_fidelity_looks_at_the_subject_only() -> None:
     assert fidelity(dark, disk()).item() == pytest.approx(20, abs=1e-3)  # 0.1 off everywhere on the subject
 
 
+def test_frames_without_the_subject_do_not_pay_for_those_with_it() -> None:
+    video = film([0.1 * math.sin(t) for t in range(8)])
+    left = torch.arange(8)[:, None, None, None] < 4
+    video = RgbaImages(torch.where(left, video.color, 1.0), video.alpha * left)
+    wrong = RgbaImages(torch.where(video.alpha > 0, 1 - video.color, video.color), video.alpha)
+    found = {gate.name: gate for gate in evaluate_gates(evidence(wrong, video), GateSettings())}
+    assert not found["fidelity"].passed
+    assert found["fidelity"].value == pytest.approx(float(fidelity(wrong, video)[:4].mean()))
+
+
 def test_where_the_video_stands_still_no_motion_is_right_and_jumps_are_wrong() -> None:
     still = film([0.0] * 4)
     jumping = film([0.0, 0.1, 0.0, 0.1])

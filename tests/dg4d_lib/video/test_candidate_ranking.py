@@ -81,6 +81,11 @@ def test_a_good_motion_beats_a_broken_one(breaks, remark: str, good: DrivingVide
     assert remark in broken.remarks and not fine.remarks
 
 
+def test_a_black_silhouette_is_a_subject(good: DrivingVideo, subject: Tensor) -> None:
+    shape = torch.cat([torch.zeros_like(subject[..., :3]), subject[..., 3:]], -1)
+    assert score_video(replace(good, frames=torch.zeros_like(good.frames)), shape).alive == 1
+
+
 def test_a_frozen_video_is_worth_nothing(good: DrivingVideo, subject: Tensor) -> None:
     assert score_video(frozen(good), subject).total == 0
 
