@@ -110,7 +110,7 @@ def prepared(model_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
 def test_azimuth_and_scale_are_found(prepared: Job) -> None:
     placement = read_placement(prepared.outputs["placement"])
     assert placement.azimuth_deg == pytest.approx(60, abs=8)
-    assert placement.scale == pytest.approx(0.7, rel=0.06)
+    assert placement.scale == pytest.approx(0.7, rel=0.07)  # the picture is drawn a pixel wider than the model
     assert placement.agreement > 0.85
 
 
