@@ -270,7 +270,7 @@ def test_only_weights_that_allow_commercial_use_pass_where_that_is_asked_for(wei
     with pytest.raises(BadInput, match=r"--commercial-only: .* zero123-xl \("):
         strict(**{"prior.kind": "zero123"}).check_licenses()
     with pytest.raises(BadInput, match=r"stable-zero123 .*non-commercial"):
-        strict(**{"prior.kind": "zero123", "prior.weights": "stable-zero123"}).check()
+        strict(**{"prior.kind": "zero123", "prior.weights": "stable-zero123", "prior.variant": "stable"}).check()
     with pytest.raises(BadInput, match="somebody/pictures"):
         words("a newt").model_copy(update={"commercial_only": True}).check()
 
