@@ -24,7 +24,7 @@ from flows.step_errors import StepError
 from steps.contract import settings_errors
 from steps.profiles import profile as named_profile
 from steps.profiles import revise
-from steps.sources.views import HIGHEST_DEG
+from steps.sources.views import check_direction
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 
 if TYPE_CHECKING:
@@ -327,9 +327,5 @@ def _name_of(picture: Picture | None, asset: str | Path | None, video: str | Pat
 
 def _view_file(place: float | tuple[float, float], path: str | Path) -> ViewFile:
     azimuth, elevation = place if isinstance(place, tuple) else (place, 0.0)
-    if not (-360 <= azimuth <= 360 and -HIGHEST_DEG <= elevation <= HIGHEST_DEG):
-        raise BadInput(
-            f"the direction {place} of the view {path} is out of range; azimuths are -360 to 360 degrees, elevations "
-            f"-{HIGHEST_DEG:g} to {HIGHEST_DEG:g}"
-        )
+    check_direction(azimuth, elevation, str(path))
     return ViewFile(azimuth=azimuth, elevation=elevation, path=Path(path))

@@ -21,7 +21,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import over_background
 from dg4d_lib.metrics.clip import ClipModel, cosine_similarity, load_clip
 from dg4d_lib.metrics.fvd import MIN_FRAMES, fvd_consistent4d, load_i3d, logits
-from dg4d_lib.metrics.image import iou, psnr, resize_square
+from dg4d_lib.metrics.image import iou, mean_of_shown, psnr, resize_square
 from dg4d_lib.metrics.lpips import Lpips, load_lpips
 from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
@@ -136,11 +136,9 @@ def run(job: Job) -> StepReport:
 def compare(ours: ViewFrames, theirs: ViewFrames, networks: MetricNetworks) -> Metrics:
     """Compute every metric of one view as means over frames; those over time need two frames."""
     foreground = ((ours.alpha > FOREGROUND) | (theirs.alpha > FOREGROUND)).float()
-    shown = foreground.amax((1, 2, 3)) > 0
-    shown |= ~shown.any()  # all frames if none shows a subject
     metrics = {
         "psnr": float(psnr(ours.color, theirs.color).mean()),
-        "psnr_obj": float(psnr(ours.color[shown], theirs.color[shown], foreground[shown]).mean()),
+        "psnr_obj": float(mean_of_shown(psnr(ours.color, theirs.color, foreground), foreground)),
         "ssim": float(ssim(ours.color, theirs.color).mean()),
         "iou": float(iou(ours.alpha, theirs.alpha, FOREGROUND).mean()),
     }

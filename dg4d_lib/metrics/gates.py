@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.metrics.image import iou, psnr
+from dg4d_lib.metrics.image import iou, mean_of_shown, psnr
 from dg4d_lib.metrics.video import EPS, temporal_error
 
 SUBJECT_ALPHA = 0.5  # pixels with a larger alpha belong to the subject
@@ -137,7 +137,10 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
     return [
         Gate(
             "fidelity",
-            {form: float(_of_shown(fidelity(images, video), images, video)) for form, images in input_views.items()},
+            {
+                form: float(mean_of_shown(fidelity(images, video), _subject(images, video)))
+                for form, images in input_views.items()
+            },
             settings.fidelity_least,
             None,
             "dB",
@@ -231,14 +234,12 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
 
 def fidelity(images: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:
     """Return the PSNR in dB over the union of the silhouettes."""
-    region = torch.maximum(images.alpha, video.alpha) > SUBJECT_ALPHA
-    return psnr(images.color, video.color, region.to(video.alpha))
+    return psnr(images.color, video.color, _subject(images, video))
 
 
-def _of_shown(values: Float[Tensor, " b"], images: RgbaImages, video: RgbaImages) -> Float[Tensor, ""]:
-    """Return the mean over the frames that show a subject; over all if none does."""
-    shown = torch.maximum(images.alpha, video.alpha).amax((1, 2, 3)) > SUBJECT_ALPHA
-    return values[shown].mean() if shown.any() else values.mean()
+def _subject(images: RgbaImages, video: RgbaImages) -> Float[Tensor, "b h w 1"]:
+    """Return 1 in the union of the silhouettes, else 0."""
+    return (torch.maximum(images.alpha, video.alpha) > SUBJECT_ALPHA).to(video.alpha)
 
 
 def flicker(images: RgbaImages, video: RgbaImages) -> float:

@@ -28,6 +28,12 @@ def psnr(
     return -10 * mean.clamp_min(10 ** (-MAX_PSNR / 10)).log10()
 
 
+def mean_of_shown(values: Float[Tensor, " b"], region: Float[Tensor, "b h w 1"]) -> Float[Tensor, ""]:
+    """Return the mean over the images whose region is not empty; over all if all regions are."""
+    shown = (region > 0).flatten(1).any(1)
+    return values[shown].mean() if shown.any() else values.mean()
+
+
 def iou(
     alpha: Float[Tensor, "b h w 1"], ground_truth: Float[Tensor, "b h w 1"], threshold: float = 0.5
 ) -> Float[Tensor, " b"]:

@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.models.model import to_srgb
 from dg4d_lib.video.downscaling import BAND_BYTES, BandDownscaler
 from steps.sources.color_profiles import convert_to_srgb
 from steps.sources.decode_limit import DecodeLimit
@@ -278,7 +279,7 @@ class _Still:
             if self._is_premultiplied:
                 picture[..., :3] /= np.maximum(picture[..., 3:], FAINT_ALPHA)
             if self.is_linear:
-                picture[..., :3] = _srgb(picture[..., :3])
+                picture[..., :3] = to_srgb(picture[..., :3])
             yield top, picture.clip(0, 1)
 
     def value_bands(self) -> Iterator[tuple[int, Float[ndarray, "rows w 4"]]]:
@@ -356,12 +357,6 @@ def _as_rgba(pixels: Float[ndarray, "h w c"], channels: list[int]) -> Float[ndar
     if not np.isfinite(picture).all():
         np.nan_to_num(picture, copy=False, nan=0.0, posinf=1.0, neginf=0.0)
     return picture
-
-
-def _srgb(linear: np.ndarray) -> np.ndarray:
-    """Apply the sRGB transfer function (IEC 61966-2-1) to values clipped to [0, 1]."""
-    linear = linear.clip(0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _reason(message: str) -> str:

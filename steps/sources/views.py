@@ -99,12 +99,26 @@ def parse_view(text: str) -> tuple[float, float, str]:
             f"{shown(text)} is no view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
         ) from None
     azimuth, elevation = (*numbers, 0.0)[:2]
-    if abs(azimuth) > 360 or abs(elevation) > HIGHEST_DEG:
-        raise BadInput(
-            f"{shown(text)}: azimuth {azimuth:g} and elevation {elevation:g}; azimuths from -360 to 360 and elevations "
-            f"from -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are allowed"
-        )
+    check_direction(azimuth, elevation, text)
     return azimuth, elevation, file.strip()
+
+
+def check_direction(azimuth: float, elevation: float, name: str) -> None:
+    """Refuse a direction out of range.
+
+    Args:
+        azimuth: degrees.
+        elevation: degrees.
+        name: of the view, for the message.
+
+    Raises:
+        BadInput: names the view, the direction and what is allowed.
+    """
+    if not (abs(azimuth) <= 360 and abs(elevation) <= HIGHEST_DEG):  # NaN is out of range, too
+        raise BadInput(
+            f"{shown(name)}: azimuth {azimuth:g} and elevation {elevation:g} are out of range; azimuths from -360 to "
+            f"360 and elevations from -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are allowed"
+        )
 
 
 def check_apart(places: list[tuple[float, float, str]]) -> None:

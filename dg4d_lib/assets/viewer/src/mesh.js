@@ -7,7 +7,7 @@ import { pointersOf } from "./pointers.js";
 
 const CLAY = { color: 0xc9ced8, side: DoubleSide, flatShading: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
 const EDGES = { color: 0x1f3a7a, wireframe: true, transparent: true, opacity: 0.38 };
-const EARLY = 2e-5; // seconds: keys have the precision of float32, so that of a frame may lie after the frame's time
+const EARLY = 2e-5; // seconds; the key of a frame may lie a little after its time, because keys are float32
 
 /** Parses a GLB; its first animation is played. */
 export async function readMesh(bytes) {
