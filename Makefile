@@ -26,9 +26,11 @@ NAMES ?=
 
 setup: $(READY)
 
+# The other build's file is removed first: after a failed switch the environment must not count as complete. The build's
+# own file is out of date here and stays: after a failed update `make setup` tries the same build again.
 $(READY): pyproject.toml deploy/setup.sh deploy/install.sh $(wildcard deploy/locks/*.txt)
+	rm -f $(filter-out $@,$(VENV)/.ready $(VENV)/.ready-cuda)
 	PYTHON="$(PYTHON)" VENV="$(VENV)" TORCH_INDEX="$(TORCH_INDEX)" CUDA="$(CUDA)" bash deploy/setup.sh
-	rm -f $(VENV)/.ready $(VENV)/.ready-cuda
 	touch $@
 
 demo: setup

@@ -10,7 +10,8 @@ import sys
 if not (3, 11) <= sys.version_info[:2] < (3, 13):
     sys.exit(f"dg4d needs Python 3.11 or 3.12; this is {sys.version.split()[0]}. Name another: make setup PYTHON=python3.11")
 PY
-[ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV" || {
+# an interrupted or failed venv leaves an interpreter without pip
+"$VENV/bin/python" -m pip --version >/dev/null 2>&1 || "$PYTHON" -m venv "$VENV" || {
     echo "Could not make a virtual environment. On Debian: apt-get install python3-venv" >&2; exit 1; }
 export VENV TORCH_INDEX
 if [ "$CUDA" = 1 ]; then

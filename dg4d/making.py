@@ -14,12 +14,13 @@ from dg4d.asset import Asset, load
 from dg4d.progress import OnProgress, reporting
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
+from flows.engine.output_lock import is_up_to_date
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
 from flows.inputs.given_views import ViewFile, ViewsRequest
 from flows.inputs.manifest import Item, items_of
 from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.setting_reference import check_names
-from flows.packages.publish import check_folder, is_current
+from flows.packages.publish import check_folder
 from flows.step_errors import StepError
 from steps.contract import settings_errors
 from steps.profiles import profile as named_profile
@@ -222,7 +223,7 @@ def _convert(
     request.check()
     check_folder(folder, request.item, force)
     job = request.to_job(home.store())
-    if not is_current(folder, job.digest()):
+    if not is_up_to_date(folder, job.digest()):
         with reporting(job, on_progress):
             _run(job, folder, engine)
     return load(folder)

@@ -423,7 +423,7 @@ class MeshSettings(Settings):
     )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
-    density_threshold: Positive = Field(0.5, description="level of the isosurface (typical for static assets: 1.0)")
+    density_threshold: Positive = Field(0.5, description="first isosurface level that is tried; unused by source=prior")
     edge_length: Positive = Field(0.015, description="of isotropic remeshing, in units of the normalized box")
     fairing: float = Field(
         0.0, ge=0, le=1, description="world units; bumps of this wavelength lose half of their height"
@@ -435,6 +435,9 @@ class MeshSettings(Settings):
     )
     texture_size: int = Field(1024, ge=64, le=8192, description="texels per side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are baked into the texture")
+    mirror_texture: bool = Field(
+        True, description="of a guessed mesh: its far side takes the mirror image of the near one, not a blurred guess"
+    )
 
 
 class IdentitySettings(Settings):

@@ -1,13 +1,14 @@
 """Pictures of docs/inputs.md: one animal by every way of input, and the files that its commands name.
 
-    python -m docs.make_inputs [--only views asset]
+    python -m docs.make_inputs [--only views asset] [--files]
 
-The files go to out/inputs, the pictures to docs/images.
+The files go to out/inputs, the pictures to docs/images. With --files, only the files are written, in a minute or two.
 """
 
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -53,23 +54,27 @@ TURN_DEG = 20.0  # of the newt, whose head is nearer
 TILE = 96  # pixels
 QUALITY = 80  # of WebP
 Tile = Float[Tensor, "s s 3"]
+Way = tuple[list[Tile], Callable[[], Tensor]]  # what was given, and the fit that returns the rows of renders
 
 
 def main() -> None:
     """Write the files and the pictures of all ways, or of some."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", nargs="+", choices=(*WAYS, *ROWS), default=(*WAYS, *ROWS))
-    chosen = parser.parse_args().only
+    parser.add_argument("--files", action="store_true", help="write the files, without a fit or a picture")
+    given = parser.parse_args()
     painted = Painted(Newt())
     FILES.mkdir(parents=True, exist_ok=True)
-    if "cutout" in chosen:
-        save("cutout", cutout_row(painted))
-    if "depth" in chosen:
-        save("depth", depth_rows(painted))
-    for name, way in WAYS.items():
-        if name in chosen:
-            given, sheet = way(painted)
-            save(name, torch.cat([row(given), sheet]))
+    for name in given.only:
+        if name in ROWS:
+            picture = ROWS[name](painted)
+        else:
+            shown, fitted = WAYS[name](painted)
+            if given.files:
+                continue
+            picture = torch.cat([row(shown), fitted()])
+        if not given.files:
+            save(name, picture)
 
 
 def photograph(painted: Painted, frame: int, azimuth: float = 0.0, elevation: float = 0.0) -> Float[Tensor, "s s 4"]:
@@ -82,33 +87,34 @@ def subject_of(painted: Painted) -> Subject:
     return Subject("newt", torch.stack([photograph(painted, frame) for frame in range(FRAMES)]))
 
 
-def video_alone(painted: Painted) -> tuple[list[Tile], Tensor]:
+def video_alone(painted: Painted) -> Way:
     """Fit the video without anything else."""
     subject = subject_of(painted)
-    return [tile(subject.footage[frame]) for frame in SHOWN_FRAMES], sheet_of(fit(subject, PREVIEW))
+    return [tile(subject.footage[frame]) for frame in SHOWN_FRAMES], lambda: sheet_of(fit(subject, PREVIEW))
 
 
-def views(painted: Painted) -> tuple[list[Tile], Tensor]:
+def views(painted: Painted) -> Way:
     """Fit the video and pictures of three other sides."""
     files = []
     for azimuth in VIEWS_DEG:
         write_png(FILES / f"newt_{azimuth:03d}.png", photograph(painted, 0, azimuth))
         files.append(ViewFile(azimuth=azimuth, path=FILES / f"newt_{azimuth:03d}.png"))
     shown = [tile(photograph(painted, 0, azimuth)) for azimuth in (0, *VIEWS_DEG)]
-    return shown, with_sides(painted, ViewsRequest(views=tuple(files)))
+    return shown, partial(with_sides, painted, ViewsRequest(views=tuple(files)))
 
 
-def turntable(painted: Painted) -> tuple[list[Tile], Tensor]:
+def turntable(painted: Painted) -> Way:
     """Fit the video and a turntable of its first frame."""
     folder = FILES / "turntable"
     folder.mkdir(exist_ok=True)
     turned = [photograph(painted, 0, 360 * frame / TURNTABLE) for frame in range(TURNTABLE)]
     for frame, picture in enumerate(turned):
         write_png(folder / f"{frame:03d}.png", picture)
-    return [tile(picture) for picture in turned[:: TURNTABLE // 4]], with_sides(painted, ViewsRequest(turntable=folder))
+    shown = [tile(picture) for picture in turned[:: TURNTABLE // 4]]
+    return shown, partial(with_sides, painted, ViewsRequest(turntable=folder))
 
 
-def cameras(painted: Painted) -> tuple[list[Tile], Tensor]:
+def cameras(painted: Painted) -> Way:
     """Fit the video and pictures from measured cameras."""
     frames, shown = [], []
     for number, (azimuth, elevation) in enumerate([(0, 0), *CAMERAS_DEG]):
@@ -119,28 +125,33 @@ def cameras(painted: Painted) -> tuple[list[Tile], Tensor]:
         frames.append({"file_path": f"camera_{number}.png", "transform_matrix": pose.tolist()})
     angle = float(2 * np.arctan(OrbitCamera().tan_half_fov[0]))
     (FILES / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}, indent=1))
-    return shown, with_sides(painted, ViewsRequest(cameras=FILES / "transforms.json"))
+    return shown, partial(with_sides, painted, ViewsRequest(cameras=FILES / "transforms.json"))
 
 
-def asset(painted: Painted) -> tuple[list[Tile], Tensor]:
+def asset(painted: Painted) -> Way:
     """Set a mesh of the animal in motion as the video shows it."""
     vertices, colors = painted.vertices(0.0), np.power(painted.colors.numpy(), 2.2)
     model = Model((ModelPart("newt", vertices.numpy(), painted.faces.numpy(), colors=colors),))
     (FILES / "newt.glb").write_bytes(write_model_glb(model))
     own = OwnModel(subject_of(painted), model, vertices[None], painted.faces, torch.ones(len(painted.faces)))
     shown = [tile(photograph(painted, 0, azimuth, 20)) for azimuth in (30, 120, 210, 300)]
-    moved = animate(own, PREVIEW.asset)[0][torch.tensor(SHOWN_FRAMES)]
-    cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in SHOWN_DEG]
-    return shown, torch.cat([row([tile(one) for one in draw_model(model, moved, camera)]) for camera in cameras])
+
+    def sheet() -> Tensor:
+        moved = animate(own, PREVIEW.asset)[0][torch.tensor(SHOWN_FRAMES)]
+        cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in SHOWN_DEG]
+        return torch.cat([row([tile(one) for one in draw_model(model, moved, camera)]) for camera in cameras])
+
+    return shown, sheet
 
 
-def truth(painted: Painted) -> tuple[list[Tile], Tensor]:
+def truth(painted: Painted) -> Way:
     """Draw the animal itself."""
     drawn = [[tile(photograph(painted, frame, azimuth)) for frame in SHOWN_FRAMES] for azimuth in SHOWN_DEG]
-    return [tile(photograph(painted, frame)) for frame in SHOWN_FRAMES], torch.cat([row(tiles) for tiles in drawn])
+    shown = [tile(photograph(painted, frame)) for frame in SHOWN_FRAMES]
+    return shown, lambda: torch.cat([row(tiles) for tiles in drawn])
 
 
-WAYS: dict[str, Callable[[Painted], tuple[list[Tile], Tensor]]] = {
+WAYS: dict[str, Callable[[Painted], Way]] = {
     "video": video_alone,
     "views": views,
     "turntable": turntable,
@@ -150,13 +161,10 @@ WAYS: dict[str, Callable[[Painted], tuple[list[Tile], Tensor]]] = {
 }
 
 
-ROWS = ("cutout", "depth")  # pictures without a fit
-
-
 def with_sides(painted: Painted, request: ViewsRequest) -> Tensor:
     """Fit the video and views beside it; return the sheet."""
     subject = subject_of(painted)
-    request.check()
+    request.check(None)
     with TemporaryDirectory() as folder:
         store = ArtifactStore(Path(folder))
         stored = request.put(store, None)
@@ -201,6 +209,9 @@ def depth_rows(painted: Painted) -> Tensor:
         rows.append([picture, *(color * alpha + 1 - alpha)])
     rows.append([blank, *painted.draw(0.0, cameras[1:])])
     return torch.cat([row([tile(picture) for picture in pictures]) for pictures in rows])
+
+
+ROWS: dict[str, Callable[[Painted], Tensor]] = {"cutout": cutout_row, "depth": depth_rows}  # pictures without a fit
 
 
 def read_picture(path: Path, animal: Float[Tensor, "s s 4"]) -> tuple[Tensor, DepthHint]:

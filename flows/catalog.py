@@ -34,6 +34,7 @@ Convert = Callable[[ConversionJob, Path], tuple[Any, bool]]
 Allow = Callable[[Item], None]
 
 JOBS_MEDIA_TYPE = "application/vnd.dg4d.orders+jsonl"
+RETRY_NOTE = " (will be retried at the end)"  # in the message of a crashed item
 
 
 @flow(name="catalog", flow_run_name="{title}", persist_result=False)
@@ -180,8 +181,10 @@ def _attempt(
         job = running.pop(future)
         content, may_heal = future.result()
         row = Row.model_validate(content)
+        if attempt > 1:
+            row.wall_s = round(row.wall_s + progress.rows[job.item].wall_s, 1)
         if may_heal and attempt == 1:
-            row = row.model_copy(update={"message": f"{row.message} (will be retried at the end)"})
+            row.message += RETRY_NOTE
             yield job
         progress.settle(row)
         gallery.update()
@@ -193,8 +196,7 @@ def _attempt(
             progress.settle(one)
             gallery.update()
         elif strict and progress.refused:
-            reason = f"not started: {progress.refused} was not accepted"
-            progress.settle(Row(item=one.item, source=one.source_name, status="skipped", message=reason))
+            progress.settle(_not_started(one, progress))
         else:
             parameters = {
                 "item": one.item,
@@ -209,6 +211,15 @@ def _attempt(
             future.add_done_callback(finished.put)
     while running:
         yield from settled()
+
+
+def _not_started(job: ConversionJob, progress: BatchProgress) -> Row:
+    """Return the row of an item that a strict batch does not start, or does not retry, after a refused one."""
+    reason = f"{progress.refused} was not accepted"
+    if crashed := progress.rows.get(job.item):
+        message = f"{crashed.message.removesuffix(RETRY_NOTE)} (not retried: {reason})"
+        return crashed.model_copy(update={"message": message})
+    return Row(item=job.item, source=job.source_name, status="skipped", message=f"not started: {reason}")
 
 
 def _converted(job: ConversionJob, folder: Path, strict: bool, work: Convert) -> tuple[Row, bool]:

@@ -8,12 +8,13 @@ from pydantic import Field
 
 from dg4d_lib.errors import DG4DError
 from flows import home
+from flows.engine.output_lock import is_up_to_date
 from flows.formatting.escaping import visible
 from flows.inputs import naming
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.manifest import Item, admitted, items_of, only_commercial
 from flows.inputs.places import parse_where
-from flows.packages.publish import check_folder, is_current
+from flows.packages.publish import check_folder
 from flows.packages.summary import Row, with_verdict
 from steps.contract import Frozen
 
@@ -84,7 +85,7 @@ def ready(item: Item, out: Path, strict: bool) -> ConversionJob | Row:
             request.check()
             check_folder(out / item.name)
             job = request.to_job(home.store())
-        return with_verdict(row, out / item.name, strict) if is_current(out / item.name, job.digest()) else job
+        return with_verdict(row, out / item.name, strict) if is_up_to_date(out / item.name, job.digest()) else job
     except DG4DError as error:
         return failed.model_copy(update={"kind": type(error).__name__, "message": visible(str(error))})
     except Exception as error:  # must not stop the other items

@@ -14,7 +14,7 @@ from flows import home
 from flows.engine.free_space import require_free_space
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
-from flows.packages.publish import Files, is_current
+from flows.packages.publish import Files, is_current, recover
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.archives import unpack
@@ -110,6 +110,7 @@ def convert_job(
     run = run or run_flow
     cached = True
     with output_lock(folder, waiting) as waited:
+        recover(folder)
         if not (waited and is_current(folder, job.digest())):
             with running(home.store(), job.item):
                 try:

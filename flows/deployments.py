@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -30,6 +30,7 @@ from flows.commands.terminal import console
 from flows.convert import connect, convert_job
 from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
+from flows.engine.output_lock import is_up_to_date
 from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
@@ -37,12 +38,12 @@ from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import box_settings, parse_changes
 from flows.inputs.naming import name_from_path
 from flows.packages.delivery import Outcome, pack_package, write_outcome
-from flows.packages.publish import check_folder, is_current
+from flows.packages.publish import check_folder
 from flows.serving.roots import Roots
 from flows.serving.server import ServerUnavailable
 from flows.ui.showing import PATIENCE_S
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
-from steps.profiles import profile, revise
+from steps.profiles import ProfileName, profile, revise
 
 WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # no address of a Dask scheduler, which runs code
 MOST_STARTS = 3  # of a run whose process dies
@@ -88,7 +89,7 @@ class Options(Frozen):
 
     model_config = ConfigDict(json_schema_extra=_sort_fields)
 
-    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"] = Field(
+    profile: ProfileName = Field(
         "preview",
         title="Profile",
         description="`preview` takes minutes on any machine, without a pretrained model; others need a GPU and weights",
@@ -116,7 +117,7 @@ class Options(Frozen):
         (), title="Further settings", description="one per item, as `motion.iterations=400`; the command's `--set`"
     )
 
-    def knobs(self) -> dict[str, Any]:
+    def changes(self) -> dict[str, Any]:
         """Return the settings that differ from the profile.
 
         Raises:
@@ -132,9 +133,9 @@ class PictureOptions(Options):
         "Motion", "used where no video model generates one (profile `preview`); empty: the subject sways"
     )
 
-    def knobs(self) -> dict[str, Any]:
+    def changes(self) -> dict[str, Any]:
         """Return the settings that differ from the profile."""
-        return super().knobs() | ({"driving.motion": self.motion} if self.motion else {})
+        return super().changes() | ({"driving.motion": self.motion} if self.motion else {})
 
 
 class Sides(Frozen):
@@ -285,7 +286,7 @@ def catalog_to_4d(
         inputs=roots.inputs(inputs),
         out=folder,
         profile=options.profile,
-        changes=_knobs(options, roots),
+        changes=_changes(options, roots),
         seed=options.seed,
         workers=workers,
         where=where,
@@ -344,7 +345,7 @@ def benchmark(
     _start()
     roots = Roots.of_this_process()
     folder, place = roots.output(out), Path(roots.folder(dataset))
-    pairs = [f"{knob}={json.dumps(value)}" for knob, value in _knobs(options, roots).items()]
+    pairs = [f"{name}={json.dumps(value)}" for name, value in _changes(options, roots).items()]
     asked = (options.profile, pairs, options.seed, mesh, bank, limit or None, workers)
     results = bench(place, folder, console(), *asked, allow=roots.check_files)
     text = f"{len(results.objects) - len(results.failed)} of {len(results.objects)} objects have scores in {out}"
@@ -382,11 +383,11 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         return failure(error)
 
 
-def _knobs(options: Options, roots: Roots) -> dict[str, Any]:
+def _changes(options: Options, roots: Roots) -> dict[str, Any]:
     """Return the settings that differ from the profile; raise BadInput for weights that may not be read."""
-    knobs = options.knobs()
-    roots.check_knobs(knobs)
-    return knobs
+    changes = options.changes()
+    roots.check_settings(changes)
+    return changes
 
 
 def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cutout, is_video: bool = False) -> None:
@@ -405,13 +406,13 @@ def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cut
 
 
 def _request(
-    item: str, options: Options, roots: Roots, knobs: Mapping[str, object] = MappingProxyType({}), **files: Any
+    item: str, options: Options, roots: Roots, changes: Mapping[str, object] = MappingProxyType({}), **files: Any
 ) -> ConversionRequest:
     """Return the request of a form, with its files by their names and further settings."""
     return ConversionRequest(
         item=item,
         profile=options.profile,
-        settings=revise(profile(options.profile), _knobs(options, roots) | dict(knobs)),
+        settings=revise(profile(options.profile), _changes(options, roots) | dict(changes)),
         seed=options.seed,
         commercial_only=options.commercial_only,
         **files,
@@ -423,7 +424,7 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     request.check()
     check_folder(folder, request.item)
     job = request.to_job(home.store())
-    if not is_current(folder, job.digest()):
+    if not is_up_to_date(folder, job.digest()):
         _convert_patiently(job, folder)
 
 

@@ -56,7 +56,7 @@ def convert_inline(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
 
 
 def run_inline(job: ConversionJob, folder: Path) -> FlowResult:
-    """Run the steps of a job, publish its package and record the version; if that fails, `folder` is as it was."""
+    """Run the steps of a job, record the version and publish its package; if that fails, `folder` is as it was."""
     conversion = conversion_of(job)
     with ThreadPoolExecutor(resources.slots(), "dg4d-step") as pool:
         engine = _Engine(pool)
@@ -70,13 +70,8 @@ def run_inline(job: ConversionJob, folder: Path) -> FlowResult:
             raise
     wall_s = round((time.time_ns() - conversion.begun_ns) / 1e9, 3)
     result = FlowResult(package=package.package, steps=engine.tasks.finished(), wall_s=wall_s)
-    swap = deliver(job, result, folder, configured_signer())
-    try:
-        keep_version(home.store(), job, result)
-    except BaseException:
-        swap.undo()
-        raise
-    swap.keep()
+    keep_version(home.store(), job, result)
+    deliver(job, result, folder, configured_signer())
     return result
 
 

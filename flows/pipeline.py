@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 
 from prefect import flow, runtime
-from prefect.transactions import transaction
 
 from flows import home
 from flows.engine.publishing import keep_version, publish
@@ -81,7 +80,6 @@ def _convert_in_flow(job: ConversionJob, folder: Path | None, mesh_parts: int, m
         )
         show_asset(job.item, result.steps, result.package, home.store())
         if folder is not None:
-            with transaction():  # a failed version restores the earlier content of the folder
-                publish(package, verdict, job, result, folder)
-                keep_version(job, result)
+            keep_version(job, result)  # first: the package in the folder makes the next run of this job end at once
+            publish(package, verdict, job, result, folder)
         return result

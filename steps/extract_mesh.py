@@ -55,7 +55,7 @@ from steps.artifacts.media import read_frames, write_png
 from steps.artifacts.mesh_plan import MeshPlan, read_plan, write_plan
 from steps.artifacts.meshes import write_meshes, write_tracked
 from steps.artifacts.motions import read_states
-from steps.fitting.guesses import guessed_shapes
+from steps.fitting.guesses import guessed_mirror, guessed_shapes
 from steps.fitting.textures import (
     LEAST_ERROR,
     Frame,
@@ -64,6 +64,7 @@ from steps.fitting.textures import (
     fitted,
     footage_of,
     frame_at,
+    mirrored,
     shown_by,
     squared_error,
     squared_errors,
@@ -147,14 +148,23 @@ def run(job: Job) -> StepReport:
             write_plan(job.outputs["plan"], MeshPlan(mode="per_frame", level=plan.level, grid=plan.grid))
             note = f"one mesh loses {lost} of {frames} frames (the Gaussians are {LOST_DB:g} dB closer to the video)"
             return _report(job, mesh, weights, [*notes, f"{note}: every frame gets its own"])
+        if guesses is not None and video and settings.mirror_texture:
+            plane = guessed_mirror(video, round(tracked.reference_frame))
+            tracked, share = mirrored(tracked, video, plane)
+            mesh = tracked.mesh
+            notes = [
+                *notes,
+                f"colors of the far side: for {share:.0%} of the texture, the mirror image of the near side",
+            ]
         write_tracked(job.outputs["tracked"], tracked)
         kind = "isosurface of the Gaussians" if guesses is None else "shape network's surface"
+        reference, agreement = tracked.reference_frame, f"{ious.mean():.1%} (IoU), {ious.min():.1%} at worst"
         notes = [
-            f"one mesh for {frames} frames: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles",
-            f"at rest it is {_check(mesh)}",
-            f"it is the {kind} of frame {tracked.reference_frame:g}, which follows the {FOLLOWED[plan.guide]} best",
+            f"one mesh for {frames} frames: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles",
+            f"at rest the mesh is {_check(mesh)}",
+            f"the mesh is the {kind} of frame {reference:g}, which follows the {FOLLOWED[plan.guide]} best",
             *notes,
-            f"its outlines agree with {OUTLINES[plan.guide]} to {ious.mean():.1%} (IoU), to {ious.min():.1%} at worst",
+            f"the mesh's outlines agree with {OUTLINES[plan.guide]} to {agreement}",
         ]
         if ious.mean() < MIN_IOU:
             notes.append("one mesh follows this motion poorly: --set mesh.mode=per_frame gives a mesh per frame")
@@ -259,7 +269,7 @@ def _tracked(
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     if video is not None:
         mesh = textured(mesh, vertices + offsets)
-    notes = [f"a trial mesh of it had {plan.followed:.1%} IoU", *_note(strands), *separated]
+    notes = [f"a trial mesh of frame {frame} had {plan.followed:.1%} IoU", *_note(strands), *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
 

@@ -16,9 +16,10 @@ import torch
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D, pose_gaussians
 from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
-from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.glb import component_notes, write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.assets.formats.rigged import PRECISE, fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
+from dg4d_lib.assets.formats.spz import scale_notes
 from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.placement import Placement, Surface, place
@@ -26,8 +27,7 @@ from dg4d_lib.assets.rendering.preview import write_mp4, write_preview, write_tu
 from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.assets.resample import (
-    MAX_STATES,
-    highest_rate,
+    nearest_rate,
     pose_gaussians_in_chunks,
     resample_asset,
     resampled_positions,
@@ -94,22 +94,27 @@ class PackageWriter:
         """Return a note if the files have another frame rate than the requested one."""
         if self.fps == (self.pack.fps or self.video.fps):
             return []
-        reason = "every frame has its own mesh" if isinstance(self.surface, list) else f"at most {MAX_STATES} states"
+        if isinstance(self.surface, list):
+            reason = "every frame has its own mesh"
+        else:
+            reason = f"at {'least' if self.fps > self.pack.fps else 'most'} {len(self.states.means)} states"
         return [f"the files have {self.fps:.4g} frames per second instead of {self.pack.fps:g} (pack.fps): {reason}"]
 
-    def write_meshes(self) -> None:
+    def write_meshes(self) -> Sequence[str]:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
         gltf, surface = self.pack.gltf, self.surface
-        if "moving" in self.inputs and isinstance(surface, Asset4D):
-            shutil.copyfile(self.inputs["moving"], self.path(packages.ASSET))
-            self.path(packages.MERGED).write_bytes(write_glb(surface, gltf))
-            return
         if isinstance(surface, Asset4D):
-            self.path(packages.ASSET).write_bytes(write_glb(surface, gltf))
-            return
+            name = packages.ASSET
+            if "moving" in self.inputs:
+                shutil.copyfile(self.inputs["moving"], self.path(name))
+                name = packages.MERGED
+            content = write_glb(surface, gltf)
+            self.path(name).write_bytes(content)
+            return component_notes(name, content)
         self.path(packages.ASSET).write_bytes(write_frames_glb(surface, self.fps, _extras(self.notes), gltf))
         for frame, mesh in enumerate(surface):
             self.path(f"{packages.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
+        return ()
 
     def write_levels(self) -> Sequence[str]:
         """Write the tracked mesh with fewer triangles."""
@@ -148,7 +153,7 @@ class PackageWriter:
             path, about = self.path(packages.USD_SPLATS), _extras(self.notes)
             write_usdz(path, self.surface, self.fps, self.states, about, self.pack.gltf, open_pbr=True, half=True)
 
-    def write_splats(self) -> None:
+    def write_splats(self) -> Sequence[str]:
         """Write the Gaussians of every frame in the requested formats, and for the viewer."""
         pack, states = self.pack, self.states
         self.path(packages.WEB_SPLATS).write_bytes(write_web_splats(states, self.fps))
@@ -159,6 +164,7 @@ class PackageWriter:
             write_spz_frames(folder, states, pack.spz_version)
         if pack.splat_gltf != "none":
             write_splat_glb_frames(folder, states, pack.splat_gltf)
+        return scale_notes(states) if pack.spz else ()
 
     def write_canonical(self) -> None:
         """Write the fit, the subject and the driving video, from which everything else was made."""
@@ -275,7 +281,7 @@ def _read_inputs(job: Job, scratch: Path) -> PackageWriter:
     _check_frames(len(video), {"motion": frames, "mesh": mesh_frames})
     fps = video.fps
     if isinstance(surface, Asset4D):
-        fps = min(pack.fps or fps, highest_rate(frames, fps))
+        fps = nearest_rate(frames, fps, pack.fps or fps)
         surface = resample_asset(surface, gaussians, deformation, frames, fps)
     if pack.delight and "moving" not in job.inputs:  # a user's model keeps its textures
         surface = _delit(surface)

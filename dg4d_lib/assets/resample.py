@@ -12,13 +12,15 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.tracking.skinning import skin_vertices
 
+MIN_STATES = 4  # fewer can miss both ends of a swing: two states of a sine that starts at 0 are equal
 MAX_STATES = 1000  # a GLB has a morph target per state, and weights of all of them at every key
 STATES_AT_ONCE = 32  # bounds memory
 
 
-def highest_rate(frames: int, fps: float) -> float:
-    """Return the largest frame rate, per second, to which `resampled_positions` resamples these frames."""
-    return max(MAX_STATES, frames) * fps / frames
+def nearest_rate(frames: int, fps: float, wanted: float) -> float:
+    """Return the frame rate nearest to the wanted one that `resampled_positions` accepts for these frames."""
+    least, most = _state_limits(frames)
+    return min(max(wanted, least / frames * fps), most / frames * fps)  # exactly fps for all frames
 
 
 def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor, " m"]:
@@ -35,15 +37,19 @@ def resampled_positions(frames: int, fps: float, wanted: float) -> Float[Tensor,
         Fractional frame numbers in [0, frames); float64, so that whole frames are exact.
 
     Raises:
-        BadInput: the result would have more than 1,000 states and more states than frames.
+        BadInput: the result would have fewer states than 4 and than frames, or more than 1,000 and than frames.
     """
-    count = max(1, round(frames * wanted / fps))
-    if count > max(MAX_STATES, frames):
+    count, (least, most) = round(frames * wanted / fps), _state_limits(frames)
+    if not least <= count <= most:
         raise BadInput(
-            f"{wanted:g} frames per second give {count} states for this motion of {frames / fps:.3g} s, at most "
-            f"{MAX_STATES} are allowed; set pack.fps to at most {highest_rate(frames, fps):.4g}"
+            f"{wanted:g} frames per second give {count} states for this motion of {frames / fps:.3g} s, {least} to "
+            f"{most} are allowed; set pack.fps to {nearest_rate(frames, fps, wanted):.4g}"
         )
     return torch.arange(count, dtype=torch.float64) * frames / count
+
+
+def _state_limits(frames: int) -> tuple[int, int]:
+    return min(MIN_STATES, frames), max(MAX_STATES, frames)
 
 
 def pose_gaussians_in_chunks(
@@ -74,7 +80,7 @@ def resample_asset(asset: Asset4D, gaussians: Gaussians, deformation: Deformatio
         fps: states per second of the result.
 
     Raises:
-        BadInput: mesh and motion have different numbers of frames, or the result would have too many states.
+        BadInput: mesh and motion have different numbers of frames, or the result would have too few or too many states.
     """
     if len(asset.offsets) != frames:
         raise BadInput(f"the mesh has {len(asset.offsets)} frames, its motion has {frames}; extract the mesh again")

@@ -21,8 +21,9 @@ _HERE = Path(__file__).parent
 _log = logging.getLogger(__name__)
 
 
+@cache
 def configure_numba() -> None:
-    """Install our cache locators and the compilation notice; call this before the first kernel is defined."""
+    """Install our cache locators and the compilation notice, once; call this before the first kernel is defined."""
     ours = [f"{__name__}.{locator.__name__}" for locator in (_EnvironmentCache, _SourceFolderCache, _UserCache)]
     locators = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's own, for kernels of others
     numba.config.CACHE_LOCATOR_CLASSES = locators  # type: ignore[attr-defined]  # missing in its stub

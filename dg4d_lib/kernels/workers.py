@@ -69,9 +69,9 @@ def run_parallel(jobs: Sequence[Callable[[], object]]) -> None:
                 future.result()
 
 
-def split_range(count: int, parts: int, multiple: int = 1) -> list[tuple[int, int]]:
-    """Split range(count) into about `parts` consecutive ranges with bounds at multiples of `multiple`."""
-    step = max(1, -(-count // max(parts, 1) // multiple)) * multiple
+def split_range(count: int, parts: int) -> list[tuple[int, int]]:
+    """Split range(count) into about `parts` consecutive ranges."""
+    step = max(1, -(-count // max(parts, 1)))
     return [(start, min(start + step, count)) for start in range(0, count, step)]
 
 

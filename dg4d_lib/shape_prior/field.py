@@ -107,8 +107,8 @@ class ShapeFields:
         """
         picture = self._pictures[frame]
         mask = picture_mask(picture)
+        features = self._features(frame)
         with torch.no_grad():
-            features = self._network.encode(torch.stack([picture, picture.flip(2)]))
             both = self._rays(features)
         logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
         knots = colors.permute(3, 2, 0, 1)[None]
@@ -118,7 +118,7 @@ class ShapeFields:
         if share > 0:
             inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
             logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
-        front, plane = straight_color(picture), self._plane(features)
+        front, plane = straight_color(picture), self._mirror_plane(features)
         if plane.trust > 0:
             probability = logits.sigmoid()
             left = transmittance(optical_density(probability, mask))
@@ -126,7 +126,17 @@ class ShapeFields:
         smoothness = KNOWN_SMOOTHNESS if self._hint.sigma else SMOOTHNESS
         return ShapeField(logits, front, hidden, mask, share, smoothness)
 
-    def _plane(self, features: Features) -> MirrorPlane:
+    def mirror_plane(self, frame: int) -> MirrorPlane:
+        """Return the mirror plane of a frame."""
+        return self._mirror_plane(self._features(frame))
+
+    def _features(self, frame: int) -> Features:
+        """Return the features of the picture and its mirror image."""
+        picture = self._pictures[frame]
+        with torch.no_grad():
+            return self._network.encode(torch.stack([picture, picture.flip(2)]))
+
+    def _mirror_plane(self, features: Features) -> MirrorPlane:
         """Return the mirror plane of a frame, the mean over the picture and its mirror image."""
         with torch.no_grad():
             moment, point, logit = self._network.mirror(features.code)

@@ -29,6 +29,14 @@ class MirrorPlane:
     point: Float[Tensor, " 3"]
     trust: float
 
+    def places(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return the mirror images of places, world units."""
+        return places - 2 * ((places - self.point) @ self.normal)[:, None] * self.normal
+
+    def directions(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return the mirror images of directions."""
+        return directions - 2 * (directions @ self.normal)[:, None] * self.normal
+
 
 def mirror_plane(moment: Float[Tensor, "3 3"], point: Float[Tensor, " 3"], symmetric: float) -> MirrorPlane:
     """Return the plane that a prediction of the network means.
@@ -67,8 +75,7 @@ def mirrored_colors(
     distance = NEAR + (depth + 0.5) * (FAR - NEAR) / BINS
     x = (2 * (column + 0.5) / SIZE - 1) * TAN_HALF_FOV * distance
     y = (1 - 2 * (row + 0.5) / SIZE) * TAN_HALF_FOV * distance
-    places = torch.stack([x, y, RADIUS - distance], -1)
-    places = places - 2 * ((places - plane.point) @ plane.normal)[:, None] * plane.normal
+    places = plane.places(torch.stack([x, y, RADIUS - distance], -1))
     at = grid_places(places[:, 0], -places[:, 1], RADIUS - places[:, 2])
     volumes = torch.stack([transmittance, probability])[None]
     left, matter = grid_sample(volumes, at[None, None, None], align_corners=False)[0, :, 0, 0]

@@ -2,7 +2,8 @@
 
 A silhouette excludes all points that it does not contain (Laurentini 1994). The hull of a few silhouettes has corners
 that no view shows: two orthogonal ones leave a square of a disc. Therefore the places of a point in the silhouettes,
-0 on the medial axis and 1 on the outline, are bounded together by a superellipse.
+0 on the medial axis and 1 on the outline, are bounded together by a superellipse. Upright views share the height of a
+point; so that it does not count in each of them, the place is 0 in the middle of a row, too.
 """
 
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -30,6 +31,7 @@ MANY = 6  # views; with more, the errors of all add up, and thin parts get lost 
 SLACK = 0.5  # pixels by which thin parts of a silhouette are wider
 THIN = 3.0  # pixels: radius of thin parts
 SMALLEST_RADIUS = 1.5  # pixels: thinner parts are not rounded
+UPRIGHT_DEG = 30.0  # largest elevation of a view whose rows are those of other views, nearly
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Volume:
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """Planes of one view: signed distance to the outline in pixels, and place between medial axis and outline."""
+    """Planes of one view: signed distance to the outline in pixels, and place between middle and outline."""
 
     view: KnownView
     planes: Float[Tensor, "1 2 h w"]
@@ -144,7 +146,18 @@ def _planes(view: KnownView, slack: float) -> Float[Tensor, "1 2 h w"]:
     widest = ndimage.maximum_filter(radius * mask, 3)  # also right beside the outline
     thin = (widest > 0) & (widest < THIN)
     place = np.where(mask & (radius > SMALLEST_RADIUS), 1 - (within / radius).clip(0, 1), 0.0)
+    if abs(view.camera.elevation_deg) <= UPRIGHT_DEG:
+        place = np.minimum(place, _places_in_rows(mask))
     return torch.from_numpy(np.stack([signed + slack * thin, place])[None]).float()
+
+
+def _places_in_rows(mask: Bool[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
+    """Return the place of every pixel in its run of a row: 0 in the middle, 1 at the ends."""
+    width = mask.shape[1]
+    columns = np.arange(width)
+    first = np.maximum.accumulate(np.where(mask, -1, columns), axis=1)  # last column outside on the left
+    after = np.minimum.accumulate(np.where(mask, width, columns)[:, ::-1], axis=1)[:, ::-1]
+    return np.where(mask, np.abs(2 * columns - first - after) / np.maximum(after - first - 1, 1), 0.0)
 
 
 def _bounds(silhouettes: Sequence[_Silhouette]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from flows import convert
 from flows.catalog_request import CatalogRequest, ready
 from flows.commands import terminal
-from flows.commands.endings import EXIT_BAD_INPUT, EXIT_FAILED
 from flows.engine import resources
+from flows.exit_status import exit_status_of
 from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
 from flows.packages.publish import check_writable
-from flows.packages.summary import BAD_INPUT, BatchProgress, Row, Writer
+from flows.packages.summary import BatchProgress, Row, Writer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -71,7 +71,7 @@ def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
     console.print(f"overview: {out / 'index.html'}", markup=False)
     if not failed:
         return 0
-    return EXIT_BAD_INPUT if all(row.kind in BAD_INPUT for row in rows) else EXIT_FAILED
+    return exit_status_of(row.kind for row in rows)
 
 
 def _convert(

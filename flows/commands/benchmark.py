@@ -11,13 +11,15 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.engine.output_lock import is_up_to_date
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING, EXIT_STATUS
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
 from flows.inputs.sources import put_zip
 from flows.packages import scores
-from flows.packages.publish import check_folder, check_writable, is_current, load_verified
+from flows.packages.publish import check_folder, check_writable, load_verified
 from flows.packages.scores import Results
-from flows.packages.summary import BAD_INPUT, BatchProgress, Row
+from flows.packages.summary import BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import MESH, GroundTruth, find_ground_truth, find_ground_truths
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
 
 NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # files of a package for rendering
 SCORE = "score."  # prefix of the settings of scores
-MISSING = frozenset(["StepMissing", "StepLost", "StepUnreachable"])  # kinds of failure that the user can mend
 ASSETS, FILMS = "assets", "films"  # folders of a benchmark
 
 
@@ -90,9 +91,9 @@ def score(
             [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
         )
     for one in judged.results.failed:
-        if one.kind in BAD_INPUT:
+        if EXIT_STATUS.get(one.kind) == EXIT_BAD_INPUT:
             raise BadInput(f"{package} cannot be scored against {truth}: {one.error}")
-        raise (StepMissing if one.kind in MISSING else StepError)("score_asset", one.error)
+        raise (StepMissing if EXIT_STATUS.get(one.kind) == EXIT_MISSING else StepError)("score_asset", one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         as_text = scores.markdown if out.suffix.lower() == ".md" else _json
@@ -250,7 +251,7 @@ def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "
     from flows.catalog import run_jobs
 
     rows = {job.item: Row(item=job.item, status="unchanged") for job in jobs}
-    waiting = [job for job in jobs if not is_current(folder / job.item, job.digest())]
+    waiting = [job for job in jobs if not is_up_to_date(folder / job.item, job.digest())]
     if not waiting:
         return rows
     with terminal.batch_shown(console, [job.item for job in waiting]) as table:

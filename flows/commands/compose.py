@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 from pydantic import ValidationError
 
 from dg4d_lib.assets.scenes.scene import Scene, SceneItem
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from flows.inputs.package_record import record_of
 from flows.packages.publish import check_writable, load_verified
 from steps.store.files import room_for
@@ -29,7 +29,7 @@ def compose(
         packages: folders, from left to right; none with a scene file.
         out: scene, ending in .glb or .usdz; written atomically.
         scene: scene file, JSON (`Scene`).
-        spacing: between neighbors without a scene file, world units.
+        spacing: between neighbors without a scene file, meters.
         preview: also render a video, beside the scene and under its name.
         progress: called with the number of rendered frames and their total.
 
@@ -77,16 +77,37 @@ def read_scene(path: Path) -> Scene:
     except OSError as error:
         raise BadInput(f"the scene file {path} cannot be read: {error.strerror}") from error
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, e['loc'])) or 'JSON'}: {e['msg']}" for e in error.errors()]
-        raise BadInput(f"the scene file {path} cannot be used: {'; '.join(lines)}") from error
+        raise BadInput(f"the scene file {path} cannot be used: {_problems(error)}") from error
     for number, item in enumerate(scene.items):
         place = PurePath(item.package)
         if place.is_absolute() or ".." in place.parts:
             raise BadInput(
-                f"{path}: items.{number}.package leads outside of the scene file's folder: {item.package}; "
+                f"{path}: items[{number}].package leads outside of the scene file's folder: {item.package}; "
                 "put the scene file above its packages"
             )
     return scene
+
+
+def _problems(error: ValidationError) -> str:
+    """Return what is wrong in a scene file, field by field."""
+    lines = []
+    for each in error.errors(include_url=False):
+        *above, last = each["loc"] or ("",)
+        place = _path(above) or "the scene"
+        if each["type"] == "extra_forbidden":
+            allowed = ", ".join((SceneItem if above else Scene).model_fields)
+            lines.append(f"{place} has an unknown field {quoted(last)}; allowed: {allowed}")
+        elif each["type"] == "missing":
+            lines.append(f"{place} has no {last}, which is required")
+        elif each["type"] != "too_short" or not each["input"]:  # invalid items do not count towards the length
+            given = f"{_path(each['loc'])} = {quoted(each['input'])}: " if each["loc"] else ""
+            lines.append(given + each["msg"])
+    return "; ".join(lines)
+
+
+def _path(location: Sequence[int | str]) -> str:
+    """Return the name of a field, for example items[0].scale."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).removeprefix(".")
 
 
 def _check_out(out: Path) -> None:

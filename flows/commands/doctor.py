@@ -62,8 +62,8 @@ def _print(out: "Console", profile: str, machine: "Machine", found: dict[str, "R
         out.print(f"  lacks {visible(lack)}", markup=False)
     if chosen.command:
         out.print(f"  {chosen.command}", markup=False, soft_wrap=True)
-    if chosen.state == "slow":
-        out.print("  It can run, but its networks run on the processor, for days.", markup=False)
+    if chosen.weights and machine.gpu_problem:
+        out.print("  Without a GPU its networks run on the processor, for days.", markup=False)
 
 
 def _machine_table(machine: "Machine") -> "Table":

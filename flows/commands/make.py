@@ -9,13 +9,14 @@ from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
 from flows.convert import convert_job
-from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.engine.output_lock import is_up_to_date
+from flows.exit_status import exit_status_of
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
 from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_gates
-from flows.packages.publish import check_folder, is_current
-from flows.step_errors import StepBadInput, StepError
+from flows.packages.publish import check_folder
+from flows.step_errors import StepError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -77,9 +78,7 @@ def make_each(wish: Wish, console: "Console") -> int:
     console.print(f"{len(items) - len(failed)} of {len(items)} assets are in {wish.out or Path('out')}", markup=False)
     if not failed:
         return 0
-    return (
-        EXIT_BAD_INPUT if all(isinstance(error, BadInput | StepBadInput) for error in failed.values()) else EXIT_FAILED
-    )
+    return exit_status_of(type(failed[item]).__name__ if item in failed else "" for item in items)
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
@@ -92,7 +91,7 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
     check_folder(folder, item, wish.force)
     job = request.to_job(home.store())
     named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
-    cached = named == item and is_current(folder, job.digest())
+    cached = named == item and is_up_to_date(folder, job.digest())
     if not cached:
         _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
     if cached:

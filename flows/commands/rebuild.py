@@ -94,7 +94,7 @@ def rebuild(folder: Path, record: Mapping[str, Any], job: ConversionJob, out: Pa
     made = run_flow(job, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
     again = {done.label: done.result for done in made.steps}
     if out is not None:
-        deliver(job, made, out, signer).keep()
+        deliver(job, made, out, signer)
     with TemporaryDirectory(prefix="dg4d-rebuild-") as scratch:
         new = Path(scratch) / "new"
         new.mkdir()

@@ -34,13 +34,15 @@ LINE_EVERY_S = 10.0  # between two progress lines of a step, without a terminal
 WIDE = 130  # columns from which all values of a step fit beside its bar
 ROWS_SHOWN = 30  # of a batch
 SHORT_S = 0.5  # waiting times below this are not shown
+UNWRAPPED = 10_000  # columns without a terminal: tables are not wrapped for the program that reads them
 COUNTED = 1  # totals up to this are not shown as a fraction
 
 
 def console(stderr: bool = False) -> Console:
     """Return a console on standard output, or on standard error if programs read standard output."""
     stream = sys.stderr if stderr else sys.stdout
-    return _Terminal(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+    wide = not stream.isatty()
+    return _Terminal(stderr=stderr, highlight=False, soft_wrap=wide, width=UNWRAPPED if wide else None)
 
 
 class _Terminal(Console):
@@ -313,7 +315,7 @@ def print_next(out: Console, folder: Path) -> None:
         out.print(f"report: {folder / 'report.html'}", markup=False)
     if (folder / "viewer.html").is_file():
         command = shlex.join(["dg4d", "view", str(folder)])
-        out.print(f"viewer: {folder / 'viewer.html'}, opened in a browser by `{command}`", markup=False)
+        out.print(f"viewer: {folder / 'viewer.html'} (open it with `{command}`)", markup=False)
 
 
 def print_tables(out: Console, tables: Iterable[tuple[str, Sequence[Mapping[str, str]]]]) -> None:

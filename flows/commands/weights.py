@@ -201,4 +201,4 @@ def _files_of(one: "Weights", locked: "LockEntry | None") -> list[tuple[str, str
 
 
 def _size(locked: "LockEntry") -> str:
-    return f"{sum(file.size for file in locked.files.values()) / 1e9:.2f}"
+    return _gb(sum(file.size for file in locked.files.values()))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from flows import home
 from flows.engine import resources
+from flows.packages.publish import is_current, leftovers, recover
 from flows.processes import locked
 
 POLL_S = 0.2  # between two attempts
@@ -39,3 +40,18 @@ def output_lock(folder: Path, waiting: Callable[[], None]) -> Iterator[bool]:
             waiting()
         if resources.stopping.wait(POLL_S):
             raise resources.Stopped(f"stopped while another run writes {folder}")
+
+
+def is_up_to_date(folder: Path, job_digest: str) -> bool:
+    """Return True if a folder holds the unaltered package of a job; clean up after a run that was killed there.
+
+    Raises:
+        Stopped: the user stopped the command while another run wrote the folder.
+    """
+    if not is_current(folder, job_digest):
+        return False
+    if not leftovers(folder):
+        return True
+    with output_lock(folder, lambda: None):
+        recover(folder)
+        return is_current(folder, job_digest)

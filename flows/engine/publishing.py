@@ -4,25 +4,19 @@ from pathlib import Path
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
-from prefect.transactions import Transaction, get_transaction
 
 from flows import home
 from flows.engine import versions
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured_signer
 from flows.packages.flow_result import FlowResult
-from flows.packages.publish import Swap
 from flows.packages.report import deliver
 from steps.contract import StepResult
-
-SWAP = "swap"  # key of the swap in the transaction
 
 
 @task(name="publish", task_run_name="publish: {job.item}", cache_policy=NO_CACHE, persist_result=False)
 def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result: FlowResult, folder: Path) -> None:
-    """Write the reports, sign the files if a key is configured_signer, and put the package into the output folder.
-
-    In a transaction the package that was there comes back if a later task of the transaction fails.
+    """Write the reports, sign the files if a key is configured, and put the package into the output folder.
 
     Args:
         package: result of `pack_asset`.
@@ -33,30 +27,9 @@ def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result
 
     Raises:
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; the folder is as it was.
-        BackendUnavailable: a key is configured_signer, and signing is not installed.
+        BackendUnavailable: a key is configured, and signing is not installed.
     """
-    swap = deliver(job, result, folder, configured_signer())
-    transaction = get_transaction()
-    if transaction is None:
-        swap.keep()
-    else:
-        transaction.set(SWAP, swap)
-
-
-@publish.on_rollback
-def restore(transaction: Transaction) -> None:
-    """Put the earlier package back."""
-    swap: Swap | None = transaction.get(SWAP, None)
-    if swap is not None:
-        swap.undo()
-
-
-@publish.on_commit
-def discard(transaction: Transaction) -> None:
-    """Remove the earlier package."""
-    swap: Swap | None = transaction.get(SWAP, None)
-    if swap is not None:
-        swap.keep()
+    deliver(job, result, folder, configured_signer())
 
 
 @task(name="keep_version", task_run_name="keep_version: {job.item}", cache_policy=NO_CACHE, persist_result=False)

@@ -1,6 +1,5 @@
 """Remarks on a cut-out that the user should read before the conversion goes on, and first looks at the splats."""
 
-import json
 import os
 import re
 import tempfile
@@ -53,7 +52,7 @@ def _failed_gates(result: StepResult) -> list[str]:
     if GATES not in result.outputs:
         return []
     try:
-        verdict = json.loads(home.store().path(result.outputs[GATES]).read_text(encoding="utf-8"))
+        verdict = home.store().load_json(result.outputs[GATES])
     except (OSError, ArtifactMissing, StoreUnreachable):
         return []
     return [

@@ -7,7 +7,6 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,13 +103,6 @@ def load_verified(folder: Path) -> dict[str, Any]:
 
 
 def publish(package: Path, folder: Path, finish: Finish) -> Files:
-    """Replace the package in a folder without a way back; see `replace_package`."""
-    swap = replace_package(package, folder, finish)
-    swap.keep()
-    return swap.files
-
-
-def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
     """Unpack a package beside `folder`, finish it, and replace the package in `folder`.
 
     Files in `folder` that no package brought stay. If anything fails, `folder` is as it was.
@@ -122,7 +114,7 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
             digests of the package's files after that.
 
     Returns:
-        The finished swap; call `keep` or `undo` on it.
+        Digests of the files of the new package.
 
     Raises:
         DiskFull: the disk is full.
@@ -133,11 +125,11 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
     try:
         with room_for(folder):
             try:
-                return replace(_publish(package, folder, finish), first_made=missing)
+                return _publish(package, folder, finish)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return replace(_publish(package, folder, finish, in_place=True), first_made=missing)
+                return _publish(package, folder, finish, in_place=True)
     except BaseException as error:
         _remove_empty(missing)
         if isinstance(error, OSError):
@@ -145,42 +137,27 @@ def replace_package(package: Path, folder: Path, finish: Finish) -> "Swap":
         raise
 
 
-@dataclass(frozen=True)
-class Swap:
-    """Replacement of a package that can be undone.
+def leftovers(folder: Path) -> list[Path]:
+    """List what commands that were killed while they published left beside a folder, or in it."""
+    folder, left = folder.resolve(), []
+    for path in sorted(p for place in (folder.parent, folder) for p in place.glob(f".{glob.escape(folder.name)}.*-*")):
+        kind, _, pid = path.name.removeprefix(f".{folder.name}.").partition("-")
+        # in containers, process ids are used again
+        gone = pid.isdigit() and (int(pid) == os.getpid() or not Path(f"/proc/{pid}").exists())
+        left += [path] if gone and kind in {"incoming", "outgoing"} else []
+    return left
 
-    Attributes:
-        folder: output folder.
-        files: digests of the files of the new package.
-        before: folder with the earlier content; it does not exist if there was none.
-        moved_in: files of the new package if they were moved in one by one; else None.
-        first_made: outermost parent folder that was created for the package; None if none was.
-    """
 
-    folder: Path
-    files: Files
-    before: Path
-    moved_in: tuple[Path, ...] | None = None
-    first_made: Path | None = None
-
-    def keep(self) -> None:
-        """Remove the earlier package, and move the user's files over from its folder."""
-        if self.before.exists():
-            _carry_over(_foreign(self.before) if self.moved_in is None else [], self.before, self.folder)
-
-    def undo(self) -> None:
-        """Restore the folder as it was, and remove parent folders that were created for it."""
-        if self.moved_in is None:
-            remove_tree(self.folder)
-            if self.before.exists():
-                self.before.replace(self.folder)
-            _remove_empty(self.first_made)
-            return
-        for name in self.moved_in:
-            (self.folder / name).unlink(missing_ok=True)
-        for path in sorted(p for p in self.before.rglob("*") if p.is_file()):
-            path.replace(self.folder / path.relative_to(self.before))
-        remove_tree(self.before)
+def recover(folder: Path) -> None:
+    """Clean up the `leftovers` of a folder: put its package or the user's files back, and remove the rest."""
+    folder = folder.resolve()
+    for left in leftovers(folder):
+        if left.name.startswith(f".{folder.name}.incoming"):
+            remove_tree(left)
+        elif folder.exists():
+            _carry_over(left, folder)
+        else:
+            left.replace(folder)
 
 
 def unpacked(package: Path, folder: Path) -> Files:
@@ -206,12 +183,12 @@ def bytes_digest(content: bytes) -> dict[str, Any]:
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
 
 
-def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Swap:
+def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Files:
     if folder.exists() and not folder.is_dir():  # created since the output was checked
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
-    _recover(folder, place)
+    recover(folder)
     staging = place / f".{folder.name}.incoming-{os.getpid()}"
     before = staging.with_name(f".{folder.name}.outgoing-{os.getpid()}")
     remove_tree(staging)
@@ -219,9 +196,13 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
         staging.mkdir()
         files = finish(staging, unpacked(package, staging))
         if in_place or Path.cwd().is_relative_to(folder):
-            return Swap(folder, files, before, tuple(_move_in(staging, folder, before)))
-        _swap(staging, folder, before)
-        return Swap(folder, files, before)
+            _move_in(staging, folder, before)
+            remove_tree(before)
+        else:
+            _swap(staging, folder, before)
+            if before.exists():
+                _carry_over(before, folder)
+        return files
     finally:
         remove_tree(staging)
 
@@ -263,8 +244,9 @@ def _swap(staging: Path, folder: Path, before: Path) -> None:
         raise
 
 
-def _carry_over(names: list[Path], outgoing: Path, folder: Path) -> None:
-    for name in names:
+def _carry_over(outgoing: Path, folder: Path) -> None:
+    """Move the user's files over from the folder of an earlier package, and remove that."""
+    for name in _foreign(outgoing):
         target = folder / name
         if not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -272,23 +254,7 @@ def _carry_over(names: list[Path], outgoing: Path, folder: Path) -> None:
     remove_tree(outgoing)
 
 
-def _recover(folder: Path, place: Path) -> None:
-    """Clean up after commands that were killed while they published."""
-    for left in sorted(place.glob(f".{glob.escape(folder.name)}.*-*")):
-        kind, _, pid = left.name.removeprefix(f".{folder.name}.").partition("-")
-        if kind not in {"incoming", "outgoing"} or not pid.isdigit():
-            continue
-        if int(pid) != os.getpid() and Path(f"/proc/{pid}").exists():  # in containers, process ids are used again
-            continue
-        if kind == "incoming":
-            remove_tree(left)
-        elif folder.exists():
-            _carry_over(_foreign(left), left, folder)
-        else:
-            left.replace(folder)
-
-
-def _move_in(staging: Path, folder: Path, before: Path) -> list[Path]:
+def _move_in(staging: Path, folder: Path, before: Path) -> None:
     """Move the old files to `before` and the new ones in, one by one, for folders that cannot be renamed.
 
     The record goes last, so that an interrupted swap is recognized.
@@ -302,7 +268,6 @@ def _move_in(staging: Path, folder: Path, before: Path) -> list[Path]:
         if (staging / name).exists():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (staging / name).replace(folder / name)
-    return new
 
 
 def _foreign(folder: Path) -> list[Path]:

@@ -21,7 +21,7 @@ from flows.packages.crate import AUTHOR, CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_name
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import Files, Swap, bytes_digest, replace_package
+from flows.packages.publish import Files, bytes_digest, publish
 from flows.packages.view import VIEWER, viewer_html
 from steps.contract import RUN_ONLY
 from steps.store.artifact_store import ArtifactStore
@@ -33,10 +33,10 @@ GENERATIVE = (  # steps that generate parts of the asset if they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
-def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> Swap:
-    """Put the package of a conversion with reports and record into a folder; see `replace_package`."""
+def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> Files:
+    """Put the package of a conversion with reports and record into a folder; see `publish`."""
     store = home.store()
-    return replace_package(
+    return publish(
         store.path(result.package),
         folder,
         lambda staging, files: finish_package(staging, files, job, result, store, signer),
@@ -216,7 +216,7 @@ def report_page(report: dict[str, Any], shortcomings: bytes | None = None, cutou
 def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
     record = done.result.provenance
     drawn = [
-        json.loads(store.path(ref).read_text(encoding="utf-8"))
+        store.load_json(ref)
         for ref in done.result.outputs.values()
         if ref.media_type.endswith("curves+json") and store.has(ref)
     ]

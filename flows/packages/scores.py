@@ -9,11 +9,10 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
-from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED
+from flows.exit_status import exit_status_of
 from flows.formatting.escaping import csv_cell
 from flows.formatting.escaping import markdown as escaped
 from flows.packages.html_pages import render
-from flows.packages.summary import BAD_INPUT
 
 Figures = dict[str, float]
 
@@ -122,11 +121,10 @@ class Results(BaseModel):
 
     @property
     def exit_code(self) -> int:
-        """Exit status: 0 if every object has scores, 65 if all failed because of bad input, else 1."""
+        """Exit status: 0 if every object has scores, else that of `exit_status_of`."""
         if not self.failed:
             return 0
-        bad = all(one.error and one.kind in BAD_INPUT for one in self.objects)
-        return EXIT_BAD_INPUT if bad else EXIT_FAILED
+        return exit_status_of(one.kind for one in self.objects)
 
 
 def figures_of(judgment: Mapping[str, Any]) -> Figures:

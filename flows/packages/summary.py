@@ -22,7 +22,6 @@ from steps.store.files import write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
 NOT_ACCEPTED = "NotAccepted"  # kind of failure of a finished item that fails a gate in a strict batch
-BAD_INPUT = {"BadInput", "StepBadInput", "BackendUnavailable"}  # kinds of failure caused by the input
 CSV_COLUMNS = (
     "item", "source", "status", "kind", "message", "attempts", "wall_s", "compute_s", "cpu_s", "gpu_s", "cost",
     "failing",
@@ -41,7 +40,7 @@ class Row(BaseModel):
         kind: name of the exception of a failure.
         message: for people.
         attempts: in this batch.
-        wall_s: wall-clock seconds in this batch, with waiting.
+        wall_s: wall-clock seconds of all attempts in this batch, with waiting.
         compute_s: sum of the compute times of its steps, including cached ones.
         cpu_s: CPU seconds of these steps.
         gpu_s: part of `compute_s` in steps that used a GPU.

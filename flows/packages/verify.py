@@ -56,10 +56,10 @@ class Verification(Frozen):
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
         """Yield name, state and detail of everything that is not whole, and one row per kind for all that is."""
-        for kind, several in (("file", "files"), ("record", "records of steps"), ("signature", "signatures")):
+        for kind, one in (("file", "file"), ("record", "step record")):
             checks = [check for check in self.checks if check.kind == kind]
             if count := sum(check.state == "whole" for check in checks):
-                yield f"{count} {kind if count == 1 else several}", "whole", ""
+                yield f"{count} {one}{'s' * (count != 1)}", "unchanged", ""
             yield from ((check.name, check.state, check.detail) for check in checks if check.state != "whole")
 
 

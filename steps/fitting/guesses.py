@@ -1,4 +1,4 @@
-"""Shapes that meshes take from the shape network."""
+"""What meshes take from the shape network: shapes and mirror planes."""
 
 from pathlib import Path
 
@@ -6,6 +6,9 @@ import torch
 
 from dg4d_lib.guidance.interface import SubjectShapes
 from dg4d_lib.settings import LearnedPriorSettings
+from dg4d_lib.shape_prior import packaged
+from dg4d_lib.shape_prior.field import ShapeFields
+from dg4d_lib.shape_prior.mirror import MirrorPlane
 from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting.priors import subject_hint, subject_shapes
 
@@ -21,3 +24,9 @@ def guessed_shapes(video: DrivingVideo, depth: Path | None, turn_deg: float) -> 
     prior = LearnedPriorSettings()
     hint = subject_hint(prior, None, depth, turn_deg)
     return subject_shapes(prior, list(torch.cat([video.frames, video.alpha], -1)), hint)
+
+
+def guessed_mirror(video: DrivingVideo, frame: int) -> MirrorPlane:
+    """Return the mirror plane that the shape network sees in a frame."""
+    cutout = torch.cat([video.frames[frame], video.alpha[frame]], -1)
+    return ShapeFields(packaged.packaged_network(), [cutout]).mirror_plane(0)

@@ -250,7 +250,7 @@ def _carried_shapes(
 def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
     """Return what the shape network says of every frame; the video carries what it says of the first one along."""
     fields = ShapeFields(packaged.packaged_network(), cutouts, hint)
-    return CarriedFields(fields, fields.predict(0), cutouts, MOST_STRAIN) if len(cutouts) > 1 else fields
+    return CarriedFields(fields, None, cutouts, MOST_STRAIN) if len(cutouts) > 1 else fields
 
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:

@@ -10,14 +10,16 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.render import render_mesh
-from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.render import render_mesh, smooth_normals
+from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture
 from dg4d_lib.mesh.texturing.chart_packing import THOROUGH, Effort
 from dg4d_lib.mesh.texturing.footage import fit_texture
+from dg4d_lib.mesh.texturing.mirrored import mirror_texture
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.reference_frame import evenly_spaced
 from dg4d_lib.settings import MeshSettings
+from dg4d_lib.shape_prior.mirror import MirrorPlane
 from dg4d_lib.video.driving import DrivingVideo
 
 Frame = tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]  # color and alpha
@@ -87,6 +89,26 @@ def fitted(
     """Return the mesh with its texture fitted to the video."""
     footage = footage_of(moved, faces, sources, video, mesh, FITTED, FITTED_SELECTIVITY)
     return replace(mesh, texture=fit_texture(mesh, footage))
+
+
+def mirrored(tracked: TrackedMesh, video: DrivingVideo, plane: MirrorPlane) -> tuple[TrackedMesh, float]:
+    """Return the mesh with colors of its near side where no frame shows its far side, and the share of such texels.
+
+    Args:
+        tracked: mesh that follows the video.
+        video: of the camera at azimuth and elevation 0.
+        plane: mirror plane of the subject at the reference frame.
+    """
+
+    def moved(frame: int) -> TexturedMesh:
+        return replace(tracked.mesh, vertices=tracked.mesh.vertices + tracked.offsets[frame])
+
+    footage = []
+    for frame in evenly_spaced(len(video), COLORED):
+        posed = moved(frame)
+        footage.append(PosedSurface(posed.vertices, smooth_normals(posed), video.frames[frame], video.alpha[frame]))
+    texture, share = mirror_texture(moved(round(tracked.reference_frame)), footage, plane)
+    return replace(tracked, mesh=replace(tracked.mesh, texture=texture)), share
 
 
 def footage_of(

@@ -1,5 +1,6 @@
 """The images: linted, complete, and steps that give in a container what they give elsewhere."""
 
+import fnmatch
 import json
 import os
 import re
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from docker.utils.build import exclude_paths
 
 from dg4d_lib.errors import BackendUnavailable
 from flows import home
@@ -107,14 +109,16 @@ def test_images_of_steps_have_every_dependency_but_those_of_the_command() -> Non
 
 
 def test_the_context_of_a_build_is_what_images_are_made_of() -> None:
-    allowed = {line[1:].split("/")[0] for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"}
+    patterns = [line for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] != "#"]
+    allowed = [line[1:] for line in patterns if line[:1] == "!"]
     copied = {
-        word.split("/")[0]
+        word
         for path in DOCKERFILES
         for line in re.findall(r"^COPY (?!--from)(.+) \S+$", path.read_text(), re.MULTILINE)
         for word in line.split()
     }
-    assert copied == allowed
+    assert copied - exclude_paths(str(ROOT), patterns) == set()
+    assert [pattern for pattern in allowed if not fnmatch.filter(copied, pattern)] == []
 
 
 @pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)

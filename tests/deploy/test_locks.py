@@ -218,6 +218,49 @@ def test_setup_for_cuda_replaces_the_cpu_build_of_torch(
     assert any("uninstall" in call and call.endswith(" torch") for call in calls) is replaced
 
 
+@pytest.mark.parametrize("interpreter", [True, False], ids=["half-made", "missing"])
+def test_setup_makes_an_environment_again_that_has_no_pip(tmp_path: Path, interpreter: bool) -> None:
+    if interpreter:
+        (tmp_path / "environment" / "bin").mkdir(parents=True)
+        (tmp_path / "environment" / "bin" / "python").write_text("#!/bin/sh\nexit 1\n")
+        (tmp_path / "environment" / "bin" / "python").chmod(0o755)
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\ncase "$*" in *venv*) echo "$*" >&2; exit 1;; esac\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    environment = {**os.environ, "VENV": str(tmp_path / "environment"), "PYTHON": str(python)}
+    command = ["bash", DEPLOY / "setup.sh"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    made, advice = done.stderr.splitlines()
+    assert made == f"-m venv {tmp_path / 'environment'}" and "apt-get install python3-venv" in advice
+
+
+@pytest.mark.parametrize(
+    ("before", "asked", "after"),
+    [
+        (".ready", ["CUDA=1"], 'CUDA="0"'),
+        (".ready-cuda", ["CUDA=0"], 'CUDA="0"'),
+        (".ready-cuda", [], 'CUDA="1"'),
+    ],
+    ids=["to CUDA", "to the CPU", "update"],
+)
+def test_setup_that_failed_is_done_again(tmp_path: Path, before: str, asked: list[str], after: str) -> None:
+    (tmp_path / "deploy").mkdir()
+    (tmp_path / ".venv").mkdir()
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name, text in {"pyproject.toml": "", "deploy/install.sh": "", "deploy/setup.sh": "exit 1\n"}.items():
+        (tmp_path / name).write_text(text)
+        os.utime(tmp_path / name, (1000, 1000))
+    (tmp_path / ".venv" / before).touch()
+    if not asked:  # a change of the project
+        os.utime(tmp_path / ".venv" / before, (500, 500))
+    own = {"PATH": os.environ["PATH"]}  # not the variables of a make that runs the tests
+    failed = subprocess.run(["make", "setup", *asked], cwd=tmp_path, env=own, capture_output=True, check=False)
+    assert failed.returncode == 2
+    again = subprocess.run(["make", "-n", "setup"], cwd=tmp_path, env=own, capture_output=True, text=True, check=True)
+    assert after in again.stdout
+
+
 def test_every_folder_with_data_is_a_package() -> None:
     settings = PROJECT["tool"]["setuptools"]
     found = find_namespace_packages(str(ROOT), **settings["packages"]["find"])

@@ -7,13 +7,14 @@ import argparse
 import ctypes
 import json
 import logging
+import math
 import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -117,10 +118,10 @@ class Run:
         (folder / f"{WEIGHTS}.new").replace(folder / WEIGHTS)
 
     @classmethod
-    def load(cls, folder: Path, plan: Plan, device: torch.device = CPU) -> "Run":
-        """Return the run of a checkpoint; its plan holds, but for the number of samples."""
+    def load(cls, folder: Path, device: torch.device = CPU) -> "Run":
+        """Return the run of a checkpoint."""
         state = torch.load(folder / CHECKPOINT, weights_only=True, map_location=device)
-        run = cls(Plan(**{**state["plan"], "samples": plan.samples}), _config(state["config"]), device)
+        run = cls(Plan(**state["plan"]), _config(state["config"]), device)
         run.network.load_state_dict(state["network"])
         run.average.load_state_dict(state["average"])
         for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
@@ -234,27 +235,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train the shape prior, or go on where a run in the folder stopped."""
     parser = argparse.ArgumentParser(prog="python -m training.shape_prior.train", description=main.__doc__)
     parser.add_argument("folder", type=Path, help="checkpoint, weights and curves; a checkpoint in it is resumed")
-    for name, value in asdict(Plan()).items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
-    parser.add_argument("--widths", type=int, nargs=4, default=ShapePriorConfig.widths)
-    parser.add_argument("--layers", type=int, default=ShapePriorConfig.layers)
+    options, sizes = asdict(Plan()), ShapePriorConfig()  # no defaults in the parser: a resumed run has its own values
+    for name, value in options.items():
+        parser.add_argument(_option(name), type=type(value), default=argparse.SUPPRESS, help=f"default: {value}")
+    parser.add_argument("--widths", type=int, nargs=4, default=argparse.SUPPRESS)
+    parser.add_argument("--layers", type=int, default=argparse.SUPPRESS)
     parser.add_argument("--device", type=torch.device, default=CPU, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that make shapes")
     parser.add_argument("--every", type=int, default=16_000, help="samples between two validations")
     parser.add_argument("--warm-start", type=Path, help="checkpoint or weights of another run to begin with")
     given = parser.parse_args(arguments)
+    _check_ranges(parser, given)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     keep_freed_memory()
     torch.set_num_threads(given.threads)
     torch.set_float32_matmul_precision("high")  # TF32 on GPUs; processors have none
-    plan = Plan(**{name: getattr(given, name) for name in asdict(Plan())})
-    given.folder.mkdir(parents=True, exist_ok=True)
     if (given.folder / CHECKPOINT).exists():
-        run = Run.load(given.folder, plan, given.device)
-        _log.info("resumed at %d of %d samples", run.shown, plan.samples)
+        run = Run.load(given.folder, given.device)
+        _check_resumed(parser, given, run)
+        run.plan = replace(run.plan, samples=getattr(given, "samples", run.plan.samples))
+        _log.info("resumed at %d of %d samples", run.shown, run.plan.samples)
     else:
-        run = Run(plan, ShapePriorConfig(widths=tuple(given.widths), layers=given.layers), given.device)
+        plan = Plan(**{name: getattr(given, name, value) for name, value in options.items()})
+        if plan.samples < plan.batch:
+            parser.error(f"--samples is {plan.samples}, less than one batch. Give at least --batch ({plan.batch}).")
+        widths, layers = getattr(given, "widths", sizes.widths), getattr(given, "layers", sizes.layers)
+        run = Run(plan, ShapePriorConfig(widths=tuple(widths), layers=layers), given.device)
         if given.warm_start:
             _log.info("warm start; new: %s", run.warm_start(given.warm_start))
     parameters = sum(value.numel() for value in run.network.parameters())
@@ -263,6 +270,43 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _check_ranges(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """End with a message if an option is out of its range."""
+    ranges: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+        ("samples batch rays warmup threads every", lambda value: value >= 1, "at least 1"),
+        ("seed held_out layers workers", lambda value: value >= 0, "at least 0"),
+        ("lr", lambda value: 0 < value < math.inf, "more than 0"),
+        ("weight_decay", lambda value: 0 <= value < math.inf, "at least 0"),
+        ("cooldown", lambda value: 0 < value <= 1, "more than 0 and at most 1"),
+        ("ema", lambda value: 0 <= value <= 1, "0 to 1"),
+    )
+    for names, fits, allowed in ranges:
+        for name in names.split():
+            if name in given and not fits(getattr(given, name)):
+                parser.error(f"{_option(name)} is {getattr(given, name)}. Give {allowed}.")
+
+
+def _check_resumed(parser: argparse.ArgumentParser, given: argparse.Namespace, run: Run) -> None:
+    """End with a message if an option does not fit the run that is resumed."""
+    place, sizes = given.folder / CHECKPOINT, run.network.config
+    own = {**asdict(run.plan), "widths": list(sizes.widths), "layers": sizes.layers}
+    samples = getattr(given, "samples", own.pop("samples"))
+    differing = [f"{_option(name)} ({value})" for name, value in own.items() if getattr(given, name, value) != value]
+    if differing:
+        parser.error(
+            f"{place} has other settings than those given: {', '.join(differing)}. Only --samples may change when it "
+            "is resumed. Leave the others out, or name another folder for a new run."
+        )
+    if given.warm_start:
+        parser.error(f"--warm-start is for new runs; {place} is resumed. Leave it out, or name another folder.")
+    if samples < run.shown:
+        parser.error(f"--samples is {samples}, but {place} was shown {run.shown}. Give at least as many.")
 
 
 def _on_cpu(value: Any) -> Any:

@@ -34,7 +34,7 @@ from dg4d_lib.assets.formats.foreign_skeleton import (
     SkinnedVertices,
     fit_skeleton,
 )
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument, read_accessor
+from dg4d_lib.assets.formats.gltf import MAX_POSES, VERTEX_DATA, GlbReader, GltfDocument, read_accessor
 from dg4d_lib.assets.formats.joint_motion import close_loop
 from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.normals import SmoothNormals
@@ -43,7 +43,6 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
 from dg4d_lib.mesh.tracking.rig import continuous_quats
 
-MAX_POSES = 128  # morph targets; players keep their weights in uniforms, of which every GPU has at least 256
 TRIANGLES, STRIP, FAN = 4, 5, 6
 SAMPLE = 2000  # vertices, evenly chosen, that the motion of a skeleton is fitted to
 FLAT = 1e-9  # determinant of a matrix that cannot be inverted, relative to the cube of its norm

@@ -3,7 +3,8 @@
 A tracked mesh becomes one mesh whose base is frame 0, with a morph target per further frame, or with principal
 components as morph targets. Very long animations, and textures per frame in core glTF, are split into several nodes
 that share all other data. Meshes per frame become one node each, shown and hidden by its scale. All items are named.
-The baked color is the base color of a rough dielectric.
+The baked color is the base color of a rough dielectric. `largestError` in the extras of the root node bounds the errors
+of vertices along each axis, world units.
 """
 
 import io
@@ -22,7 +23,7 @@ from torch import Tensor
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.foreign_nodes import global_matrices
-from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
+from dg4d_lib.assets.formats.gltf import MAX_POSES, GlbReader, GltfDocument
 from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, to_uint8
 from dg4d_lib.assets.formats.morph_components import fit_components, principal_components
 from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
@@ -33,7 +34,6 @@ from dg4d_lib.mesh.textured import TexturedMesh
 DEFAULTS = GltfSettings(quantized=False)  # exact
 NAME = "subject"
 OFFSET_POINTER = "/materials/0/pbrMetallicRoughness/baseColorTexture/extensions/KHR_texture_transform/offset"
-MAX_POSES = 128  # per node; players keep their weights in uniforms, of which every GPU has at least 256
 _FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, OSError)  # raised by files of other layouts
 
 
@@ -107,7 +107,8 @@ def write_frames_glb(
         nodes.append(document.add("nodes", name=name, mesh=_add_mesh(document, name, mesh, cube, settings)))
         animation.add_visibility(nodes[-1], name, Span(frame, frame + 1, len(meshes)))
     animation.finish()
-    return _finish(document, nodes, cube)
+    root = document.add("nodes", name=NAME, children=nodes)  # of one, too: its animated scale would replace the cube's
+    return _finish(document, [root], cube)
 
 
 def write_mesh_glb(mesh: TexturedMesh, settings: GltfSettings = DEFAULTS) -> bytes:
@@ -169,6 +170,18 @@ def read_mesh_glb(content: bytes) -> TexturedMesh:
         raise BadInput(
             f"this GLB does not have the form of one textured mesh ({error!r}); give one that dg4d wrote"
         ) from error
+
+
+def component_notes(name: str, content: bytes) -> tuple[str, ...]:
+    """Return a note on the error of the principal components in a file of `write_glb`; none if it has frames."""
+    tree = GlbReader(content).tree
+    errors = tree["nodes"][tree["scenes"][0]["nodes"][0]].get("extras", {})
+    if "rmsError" not in errors:
+        return ()
+    return (
+        f"{name} misses the motion by {errors['rmsError']:.2g} world units (rms), at most "
+        f"{errors['largestError']:.2g}, by its principal components (pack.gltf.components)",
+    )
 
 
 def _frame_name(frame: int) -> str:
@@ -237,7 +250,7 @@ def _add_components(
     offsets: NDArray[np.float32],
     settings: GltfSettings,
 ) -> int:
-    """Add a node with principal components as morph targets; return its index."""
+    """Add a node with principal components as morph targets, and their error; return its index."""
     components, weights = principal_components(offsets, settings.components)
     # Integers stand for offsets inside the cube and changes in [-1, 1]; larger weights make up for smaller components.
     reach = shape.component_reach(components)
@@ -257,6 +270,9 @@ def _add_components(
     track = np.concatenate((weights, weights[:1]))
     node = _add_morphed_node(document, NAME, primitive, weights[0].tolist(), names)
     animation.add_morph(node, NAME, keys, track, settings.interpolation.upper())
+    missed = shape.distances(components, weights, offsets)
+    errors = {"largestError": float(missed.max()), "rmsError": float(np.sqrt(np.square(missed).mean()))}
+    document.tree["nodes"][node]["extras"] = errors
     return node
 
 
@@ -312,7 +328,8 @@ def _finish(document: GltfDocument, nodes: list[int], cube: QuantizationCube | N
     """Encode the document with a single root node, which holds the transform of the quantization cube."""
     root = nodes[0] if len(nodes) == 1 else document.add("nodes", name=NAME, children=nodes)
     if cube is not None:
-        document.tree["nodes"][root] |= {**cube.node_transform(), "extras": {"largestError": cube.max_error}}
+        document.tree["nodes"][root] |= cube.node_transform()
+        document.tree["nodes"][root].setdefault("extras", {"largestError": cube.max_error})
     document.tree["scene"] = document.add("scenes", name="asset", nodes=[root])
     return document.to_bytes()
 

@@ -13,6 +13,7 @@ from dg4d_lib.errors import BadInput
 VERTEX_DATA = 34962  # buffer view targets
 INDEX_DATA = 34963
 MAX_LENGTH = 2**32 - 1  # maximum size of a GLB, bytes
+MAX_POSES = 128  # morph targets of a node; players keep weights in uniforms, of which every GPU has at least 256
 
 _MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
 _ALIGNMENT = 4  # of vertices and buffer views, bytes

@@ -3,10 +3,11 @@
 Quantization (KHR_mesh_quantization) uses 8 bits for normals and 16 bits for positions, 14 of them in compressed files.
 Positions are integer points of a cube around all poses, and the node's transform scales the cube: plain integers, not
 fractions of the largest one, because some readers ignore that flag of an accessor. For the same reason texture
-coordinates are float32 unless the file is compressed. A position and its displacement are rounded together, so moved
-vertices are as exact as vertices of the base: half a step of the cube on each axis. Morph targets of normals must lie
-in [-1, 1]; where a change is larger, the target is a shorter normal of the right direction, which players normalize.
-Poses in which many normals have turned too far for that have 16 bits, or float32.
+coordinates are float32 unless the file is compressed. A position and its displacement are rounded together, so vertices
+moved by one morph target are as exact as those of the base: half a step of the cube on each axis. Errors of principal
+components, of which several are added, are measured. Morph targets of normals must lie in [-1, 1]; where a change is
+larger, the target is a shorter normal of the right direction, which players normalize. Poses in which many normals have
+turned too far for that have 16 bits, or float32.
 """
 
 from collections.abc import Iterable, Sequence
@@ -179,6 +180,29 @@ class MeshPrimitive:
             target["NORMAL"] = self._add(f"{name} normals", _normalized(changes, _BYTE, "i1") if fits else changes)
         return target
 
+    def distances(
+        self, components: NDArray[np.floating[Any]], weights: NDArray[np.floating[Any]], offsets: Floats
+    ) -> Floats:
+        """Return distances from vertices moved by offsets to those moved by components as readers decode them.
+
+        Args:
+            components: as given to `add_component`, "k v 3".
+            weights: of the components at every frame, "t k".
+            offsets: of the vertices at every frame, "t v 3", world units.
+
+        Returns:
+            Distances "t v", world units.
+        """
+        base = self._vertices
+        if self._cube is not None:
+            base = (self._cube.quantize(base) * self._cube.step + self._cube.center).astype(np.float32)
+            components = (self._steps(self._cube, components) * self._cube.step).astype(np.float32)
+        missed = (
+            base + np.tensordot(row, components, 1) - (self._vertices + pose)
+            for row, pose in zip(weights, offsets, strict=True)
+        )
+        return np.stack([np.linalg.norm(rows, axis=-1) for rows in missed])
+
     def turn_normals(self, offsets: Floats) -> Floats:
         """Return the changes of the normals when the vertices move by offsets."""
         return self._normals_of(self._vertices + offsets) - self._normals
@@ -186,8 +210,11 @@ class MeshPrimitive:
     def _add_offsets(self, name: str, offsets: Floats) -> int:
         if self._cube is None:
             return self._add(f"{name} positions", offsets)
-        steps = self._cube.quantize(self._vertices + offsets) - self._cube.quantize(self._vertices)
-        return self._add(f"{name} positions", steps.astype("<i2"))
+        return self._add(f"{name} positions", self._steps(self._cube, offsets).astype("<i2"))
+
+    def _steps(self, cube: QuantizationCube, offsets: Floats) -> NDArray[np.int32]:
+        """Return offsets as integers, rounded together with the vertices."""
+        return cube.quantize(self._vertices + offsets) - cube.quantize(self._vertices)
 
     def _quantize_turned(self, turned: Floats, changes: Floats) -> NDArray[Any]:
         """Quantize the changes that lead to turned normals, if few normals get too short by that."""

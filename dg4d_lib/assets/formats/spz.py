@@ -30,6 +30,8 @@ MAX_BITS = 20
 LARGEST_POSITION = 2**23 - 1  # positions are signed 24-bit integers
 SPZ4_HEADER = 32  # bytes
 LEVEL, ZSTD_LEVEL = 9, 19  # of gzip and of Zstandard
+MIN_LOG_SCALE = -10  # smaller scales become this, 0.045 mm
+THICKENED, MANY = 0.1, 0.01  # growth of a splat, relative to its largest scale, and share of such splats worth a note
 LARGEST = 2**9 - 1  # largest magnitude of a quantized quaternion component, without its sign
 
 
@@ -58,7 +60,7 @@ def write_spz(path: Path, gaussians: Gaussians, version: SpzVersion = 3) -> None
         np.rint(means * 2**bits).astype("<i4")[..., None].view(np.uint8)[..., :3],
         _bytes(255 * _array(gaussians.opacities)),
         _bytes(255 * (0.15 * harmonics + 0.5)),
-        _bytes(16 * (log_scales + 10)),
+        _bytes(16 * (log_scales - MIN_LOG_SCALE)),
         _smallest_three(_array(gaussians.quats)),
     )
     streams = [section.tobytes() for section in sections]
@@ -70,6 +72,19 @@ def write_spz(path: Path, gaussians: Gaussians, version: SpzVersion = 3) -> None
     table = b"".join(struct.pack("<QQ", len(frame), len(stream)) for frame, stream in zip(frames, streams, strict=True))
     header = common + struct.pack("<BI12x", len(streams), SPZ4_HEADER)
     path.write_bytes(header + table + b"".join(frames))
+
+
+def scale_notes(states: Gaussians) -> tuple[str, ...]:
+    """Return a note if many splats are too small for SPZ; thin axes of large splats do not count."""
+    scales = states.scales
+    growth = (math.exp(MIN_LOG_SCALE) - scales).amax(-1) / scales.amax(-1)
+    share = float((growth > THICKENED).double().mean())
+    if share < MANY:
+        return ()
+    return (
+        f"{share:.0%} of the splats are more than {THICKENED:.0%} too thick in the SPZ files, whose smallest scale is "
+        f"{1000 * math.exp(MIN_LOG_SCALE):.2g} mm; raise pack.height_m, or set pack.spz=false",
+    )
 
 
 def _array(values: torch.Tensor) -> NDArray[Any]:

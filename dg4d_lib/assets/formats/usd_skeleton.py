@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from dg4d_lib.assets.formats.joint_motion import bone_names, close_loop, relative_motion, rest_arms
-from dg4d_lib.assets.formats.usd_stage import bounds, integers, matrices, quaternions, time_code, vectors
+from dg4d_lib.assets.formats.usd_stage import animate, bounds, integers, matrices, quaternions, time_code, vectors
 from dg4d_lib.mesh.tracking.rig import Rig, rig_offsets
 
 RIG = "/asset/mesh/rig"
@@ -53,9 +53,7 @@ def add_skeleton(
     points = torch.from_numpy(vertices)
     moved = (points + rig_offsets(rig, points)).numpy()
     boxes = [bounds(pose, pose) for pose in moved]
-    extent = UsdSkel.Root(stage.GetPrimAtPath(mesh.GetPath().GetParentPath())).CreateExtentAttr()
-    for frame, box in enumerate((*boxes, boxes[0])):
-        extent.Set(box, time_code(frame, fps))
+    animate(UsdSkel.Root(stage.GetPrimAtPath(mesh.GetPath().GetParentPath())).CreateExtentAttr(), boxes, fps)
 
 
 def _joint_paths(rig: Rig) -> list[str]:

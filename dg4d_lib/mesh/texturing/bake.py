@@ -53,6 +53,9 @@ TEXELS_AT_ONCE = 1 << 16  # texels per job of the thread pool
 
 Pictures = tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]  # straight color and alpha, in [0, 1]
 Draw = Callable[[Sequence[OrbitCamera]], Pictures]
+GradedPictures = tuple[
+    Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]
+]  # color, grade, depth, and the least depth nearby: see `grade_pixels`
 
 
 @dataclass(frozen=True)
@@ -117,19 +120,18 @@ def bake_texture(
         a seam have the same colors.
     """
     size, side = settings.texture_size, settings.render_size
-    rows, columns, corners, shares = _covered_texels(faces, uvs, size)
-    texels = _placed_texels(rows, columns, corners, shares, vertices, normals)
+    rows, columns, corners, shares = covered_texels(faces, uvs, size)
+    texels = placed_texels(rows, columns, corners, shares, vertices, normals)
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
     total = np.zeros((len(texels.rows), 4), np.float32)  # sums of weight * color and of weight
-    parts, flattest = _parts(len(total)), INPUT_FLATTER * MIN_COSINE
+    flattest = INPUT_FLATTER * MIN_COSINE
     for posed in footage:
         camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
-        moved = _placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
+        moved = placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
         reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
         pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
-        rule = flattest, INPUT_WEIGHT * posed.weight
-        run_parallel([partial(_add, moved, [camera], pictures, [rule], part, total) for part in parts])
+        add_views(moved, [camera], pictures, [(flattest, INPUT_WEIGHT * posed.weight)], total)
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
@@ -138,12 +140,12 @@ def bake_texture(
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0 and not footage:
             rules[0] = flattest, INPUT_WEIGHT
-        run_parallel([partial(_add, texels, batch, renders, rules, part, total) for part in parts])
+        add_views(texels, batch, renders, rules, total)
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
     colors = torch.where(seen[:, None], torch.from_numpy(total[:, :3]) / weight.clamp_min(1e-30), 0.5)
     colors = _fill_unseen(colors, seen, texels.positions)
-    return level_seams(_fill_texture(colors, texels, size), seam_points(vertices, faces, uvs, size))
+    return level_seams(fill_texture(colors, texels, size), seam_points(vertices, faces, uvs, size))
 
 
 def locate_texels(
@@ -154,13 +156,16 @@ def locate_texels(
     size: int,
 ) -> Texels:
     """Locate the texels of a square texture on the surface; texel centers are at (index + 0.5) / size."""
-    return _placed_texels(*_covered_texels(faces, uvs, size), vertices, normals)
+    return placed_texels(*covered_texels(faces, uvs, size), vertices, normals)
 
 
-def _covered_texels(
+def covered_texels(
     faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"], Int[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return row and column of the texels in charts, and the corners of their triangle with barycentric weights."""
+    """Return row and column of the texels in charts, and the corners of their triangle with barycentric weights.
+
+    Texel centers are at (index + 0.5) / size.
+    """
     ids, weights = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
     _rasterize_uvs(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
     found = torch.from_numpy(ids)
@@ -168,7 +173,7 @@ def _covered_texels(
     return rows, columns, faces.long()[found[rows, columns].long()], torch.from_numpy(weights)[rows, columns]
 
 
-def _placed_texels(
+def placed_texels(
     rows: Int[Tensor, " p"],
     columns: Int[Tensor, " p"],
     corners: Int[Tensor, "p 3"],
@@ -177,28 +182,50 @@ def _placed_texels(
     normals: Float[Tensor, "v 3"],
 ) -> Texels:
     """Return the texels where the vertices are."""
-    share = shares[..., None]
-    return Texels(
-        rows,
-        columns,
-        (share * vertices[corners]).sum(1),
-        normalize((share * normals[corners]).sum(1), dim=-1),
+    positions, facing = (_interpolated(values, corners, shares) for values in (vertices, normals))
+    return Texels(rows, columns, positions, normalize(facing, dim=-1))
+
+
+def _interpolated(
+    values: Float[Tensor, "v 3"], corners: Int[Tensor, "p 3"], shares: Float[Tensor, "p 3"]
+) -> Float[Tensor, "p 3"]:
+    """Return values of vertices at places in triangles; one corner after the other takes half the time."""
+    first, *others = (
+        values.index_select(0, corner) * share[:, None]
+        for corner, share in zip(corners.unbind(1), shares.unbind(1), strict=True)
     )
+    return sum(others, first)
 
 
-def _parts(count: int) -> list[slice]:
-    return [slice(start, start + TEXELS_AT_ONCE) for start in range(0, count, TEXELS_AT_ONCE)]
+def add_views(
+    texels: Texels,
+    cameras: Sequence[OrbitCamera],
+    pictures: GradedPictures,
+    rules: Sequence[tuple[float, float]],
+    total: NDArray[np.float32],
+) -> None:
+    """Add the colors that texels project to in some views to their sums.
+
+    Args:
+        texels: p texels.
+        cameras: of the views.
+        pictures: of the views (`grade_pixels`).
+        rules: minimum cosine and weight of every view.
+        total: "p 4", sums of weight * color and of weight; changed.
+    """
+    parts = [slice(start, start + TEXELS_AT_ONCE) for start in range(0, len(total), TEXELS_AT_ONCE)]
+    run_parallel([partial(_add, texels, cameras, pictures, rules, part, total) for part in parts])
 
 
 def _add(
     texels: Texels,
     cameras: Sequence[OrbitCamera],
-    renders: Sequence[Tensor],
+    renders: GradedPictures,
     rules: Sequence[tuple[float, float]],
     part: slice,
     total: NDArray[np.float32],
 ) -> None:
-    """Add the colors of some texels to their sums; `rules` holds minimum cosine and weight of every camera."""
+    """Add the colors of some texels to their sums."""
     positions, normals = texels.positions[part].numpy(), texels.normals[part].numpy()
     for view, (camera, rule) in enumerate(zip(cameras, rules, strict=True)):
         pose = camera.viewmat().numpy(), camera.position().numpy(), camera.focal
@@ -224,7 +251,7 @@ def grade_pixels(
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     reach: int,
-) -> tuple[Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+) -> GradedPictures:
     """Tell which pixels of pictures lie inside the subject, and how deep the mesh is there.
 
     Args:
@@ -273,7 +300,7 @@ def _fill_unseen(
     return colors
 
 
-def _fill_texture(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Tensor, "h w 3"]:
+def fill_texture(colors: Float[Tensor, "p 3"], texels: Texels, size: int) -> Float[Tensor, "h w 3"]:
     """Write the texels into a texture and fill the empty ones.
 
     Empty texels within the gutter of a chart repeat the nearest texel of the chart, so that nothing bleeds over a seam.

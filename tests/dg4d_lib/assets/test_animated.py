@@ -6,6 +6,7 @@ import torch
 from dg4d_lib.assets.animated import interpolate_frames, pose_gaussians
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.geometry.quaternion import quat_to_rotmat
 
 
 def test_positions_on_frames_are_the_frames_of_the_deformation(red_dot: Gaussians, slide: Framewise) -> None:
@@ -17,6 +18,17 @@ def test_the_animation_returns_from_the_last_frame_to_the_first(red_dot: Gaussia
     states = pose_gaussians(red_dot, slide, 5, torch.tensor([4.0, 4.25, 4.5, 5.0]))
     assert states.means[:, 0, 0].tolist() == [0.5, 0.375, 0.25, 0.0]
     torch.testing.assert_close(states.log_scales[-1], red_dot.log_scales)
+
+
+def test_a_full_turn_goes_on_where_it_closes(red_dot: Gaussians) -> None:
+    """Turned by 300 degrees, the quaternion is nearer to the negative of the first one."""
+    angles = torch.tensor([0.0, 100.0, 200.0, 300.0]).deg2rad() / 2
+    turn = Framewise(4, 1).requires_grad_(False)
+    turn.table[:, 0, 6], turn.table[:, 0, 9] = angles.cos() - 1, angles.sin()
+    found = quat_to_rotmat(pose_gaussians(red_dot, turn, 4, torch.tensor([3.0, 3.5, 4.0])).quats[:, 0])
+    expected = torch.tensor([300.0, 330.0, 360.0]).deg2rad()
+    torch.testing.assert_close(found[:, 0, 0], expected.cos(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found[:, 1, 0], expected.sin(), atol=1e-6, rtol=0)
 
 
 def test_a_motion_of_one_frame_stands_still(red_dot: Gaussians, slide: Framewise) -> None:

@@ -15,7 +15,14 @@ from PIL import Image
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats import gltf
-from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
+from dg4d_lib.assets.formats.glb import (
+    component_notes,
+    read_glb,
+    read_mesh_glb,
+    write_frames_glb,
+    write_glb,
+    write_mesh_glb,
+)
 from dg4d_lib.assets.formats.gltf import GlbReader
 from dg4d_lib.assets.formats.normals import SmoothNormals
 from dg4d_lib.errors import BackendUnavailable, BadInput
@@ -290,6 +297,20 @@ def test_components_reproduce_a_motion_that_they_span(settings: GltfSettings) ->
     assert len(content) < len(write_glb(asset, settings.model_copy(update={"components": 0}))) / 2
 
 
+@pytest.mark.parametrize("quantized", [True, False])
+@pytest.mark.parametrize("components", [1, 3])
+def test_the_error_of_components_is_measured_and_noted(quantized: bool, components: int) -> None:
+    asset = tilted(turning_ball(12))
+    content = write_glb(asset, GltfSettings(components=components, quantized=quantized))
+    distances = (placed(read_glb(content)) - placed(asset)).norm(dim=-1)
+    extras = GlbReader(content).tree["nodes"][0]["extras"]
+    assert extras["largestError"] == pytest.approx(float(distances.max()), abs=1e-6)
+    assert extras["rmsError"] == pytest.approx(float(distances.square().mean().sqrt()), abs=1e-6)
+    (note,) = component_notes("a.glb", content)
+    assert f"{extras['rmsError']:.2g} world units (rms), at most {extras['largestError']:.2g}" in note
+    assert component_notes("a.glb", write_glb(asset, GltfSettings(quantized=quantized))) == ()
+
+
 @pytest.mark.parametrize("moving_normals", [True, False])
 def test_components_may_be_larger_than_any_displacement(moving_normals: bool) -> None:
     """Half of the triangles move at once, the others in the last frame: the first component is larger than both."""
@@ -307,6 +328,16 @@ def test_trimesh_places_quantized_vertices_and_their_texture() -> None:
     (seen,) = scene.dump()
     np.testing.assert_allclose(seen.vertices, ball().vertices, atol=2e-5)
     np.testing.assert_allclose(seen.visual.uv, ball().uvs.numpy() * (1, -1) + (0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_showing_a_mesh_does_not_replace_the_scale_of_the_cube(count: int) -> None:
+    tree = GlbReader(write_frames_glb([ball()] * count, FPS, settings=GltfSettings(quantized=True))).tree
+    shown = [channel["target"]["node"] for channel in tree["animations"][0]["channels"]]
+    (root,) = tree["scenes"][0]["nodes"]
+    assert tree["nodes"][root]["children"] == shown
+    assert tree["nodes"][root]["scale"] != [1.0] * 3
+    assert tree["nodes"][shown[0]]["scale"] == [1.0] * 3
 
 
 def test_meshes_per_frame_share_one_cube() -> None:

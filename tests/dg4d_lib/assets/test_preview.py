@@ -19,7 +19,9 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.mesh import render
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh_rasterizer.texture_cpu import mip_levels
 from dg4d_lib.rasterizer.reference import rasterize
 
 SETTINGS = PackSettings(preview_size=64, preview_turns=2)
@@ -119,6 +121,28 @@ def test_the_mesh_is_beside_the_splats(tmp_path: Path, red_dot: Gaussians, slide
     np.testing.assert_allclose(places[0][:7], places[1][:7], atol=1)
 
 
+def test_the_texture_of_a_moving_mesh_is_prepared_once_per_film(
+    tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = trimesh.creation.icosphere(1, 0.2)
+    vertices, faces = torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).int()
+    mesh = TexturedMesh(vertices, faces, torch.full((len(vertices), 2), 0.5), torch.ones(4, 4, 3))
+    prepared = []
+    monkeypatch.setattr(render, "mip_levels", lambda texture: prepared.append(texture) or mip_levels(texture))
+    for name in "ab":
+        write_preview(
+            tmp_path / f"{name}.mp4",
+            red_dot,
+            slide,
+            FRAMES,
+            FPS,
+            rasterize,
+            SETTINGS,
+            mesh_at=lambda at: replace(mesh, vertices=mesh.vertices + 0.1 * at),
+        )
+    assert len(prepared) == 2  # once per film
+
+
 def test_what_comes_near_the_camera_stays_in_the_picture(tmp_path: Path, red_dot: Gaussians) -> None:
     high = replace(red_dot, means=torch.tensor([[0.0, 0.8, -1.0]]))  # 35 degrees up from behind, where 25 are shown
     write_turntable(tmp_path / "turntable.mp4", high, rasterize, SETTINGS)
@@ -195,9 +219,14 @@ def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussian
         write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, broken, SETTINGS)
 
 
-def test_pictures_become_a_film_of_their_rate_and_colors(tmp_path: Path) -> None:
+@pytest.mark.parametrize("codec", preview.CODECS)
+@pytest.mark.parametrize("fps", [24000 / 1001, 7.0, 0.0101, 0.0004])
+def test_pictures_become_a_film_of_their_rate_and_colors(
+    tmp_path: Path, fps: float, codec: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preview, "_codec", lambda: codec)
     shades = torch.linspace(0.1, 0.9, 4)[:, None, None, None].expand(4, 32, 32, 3)
-    write_mp4(tmp_path / "film.mp4", shades, 7.0)
+    write_mp4(tmp_path / "film.mp4", shades, fps)
     pictures, rate = film(tmp_path / "film.mp4")
-    assert rate == 7
+    assert float(rate) == pytest.approx(fps, rel=1e-6)
     np.testing.assert_allclose(pictures, shades.numpy(), atol=4 / 255)

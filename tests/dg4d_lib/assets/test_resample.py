@@ -12,8 +12,9 @@ from torch.nn.functional import normalize
 from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
 from dg4d_lib.assets.resample import (
     MAX_STATES,
+    MIN_STATES,
     STATES_AT_ONCE,
-    highest_rate,
+    nearest_rate,
     pose_gaussians_in_chunks,
     resample_asset,
     resampled_positions,
@@ -92,7 +93,7 @@ def corrections() -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("fps", "states"), [(8, 16), (12, 24), (24, 48), (30, 60), (28, 56), (7, 14), (3.5, 7), (0.1, 1)]
+    ("fps", "states"), [(8, 16), (12, 24), (24, 48), (30, 60), (28, 56), (7, 14), (3.5, 7), (2, 4)]
 )
 def test_there_are_as_many_states_as_the_loop_has_room_for(fps: float, states: int) -> None:
     positions = resampled_positions(14, 7.0, fps)
@@ -109,16 +110,23 @@ def test_frames_are_met_exactly_by_whole_factors(factor: int) -> None:
 
 
 def test_a_rate_of_too_many_states_is_refused_but_all_frames_never_are() -> None:
-    with pytest.raises(BadInput, match=r"1001 states .* at most 7$"):
+    with pytest.raises(BadInput, match=r"1001 states .* 4 to 1000 are allowed; set pack.fps to 7$"):
         resampled_positions(1000, 7.0, 7.007)
     assert len(resampled_positions(2000, 7.0, 7.0)) == 2000
     assert len(resampled_positions(1000, 7.0, 7.0)) == MAX_STATES
 
 
 @pytest.mark.parametrize("frames", [1, 3, 32, 999, 1000, 1001])
-def test_the_highest_rate_gives_as_many_states_as_are_allowed(frames: int) -> None:
+def test_the_nearest_rate_gives_as_many_or_as_few_states_as_are_allowed(frames: int) -> None:
     for fps in (0.53, 23.976, 1e3 / 7):
-        assert len(resampled_positions(frames, fps, highest_rate(frames, fps))) == max(frames, MAX_STATES)
+        assert len(resampled_positions(frames, fps, nearest_rate(frames, fps, 1e9))) == max(frames, MAX_STATES)
+        assert len(resampled_positions(frames, fps, nearest_rate(frames, fps, 1e-9))) == min(frames, MIN_STATES)
+        assert nearest_rate(frames, fps, fps) == fps
+
+
+def test_a_rate_at_which_a_swing_stands_still_is_refused() -> None:
+    with pytest.raises(BadInput, match=r"2 states .* 4 to 1000 are allowed; set pack.fps to 2$"):
+        resampled_positions(14, 7.0, 1.0)
 
 
 def test_states_in_parts_are_the_states(cloud: Gaussians) -> None:
@@ -138,7 +146,7 @@ def test_frames_stay_as_they_were_bit_by_bit(asset: Asset4D, cloud: Gaussians) -
     assert (len(fine.offsets), fine.fps, fine.extras) == (4 * FRAMES, 4 * FPS, {"a": 1})
 
 
-@pytest.mark.parametrize("fps", [4 * FPS, 12.0, 3.0])
+@pytest.mark.parametrize("fps", [4 * FPS, 12.0, 6.0])
 def test_between_frames_the_mesh_turns_with_the_cloud(asset: Asset4D, cloud: Gaussians, fps: float) -> None:
     fine = resample_asset(asset, cloud, Turning(), FRAMES, fps)
     positions = resampled_positions(FRAMES, FPS, fps)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dg4d_lib.assets.formats.spz import write_spz
+from dg4d_lib.assets.formats.spz import scale_notes, write_spz
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
@@ -80,6 +80,17 @@ def test_what_lies_beyond_the_steps_becomes_the_last_of_them(tmp_path: Path) -> 
     seen = gsply.read_spz(str(tmp_path / "a.spz"))
     assert seen.scales[0].tolist() == [-10, 5.9375, 0]
     assert torch.from_numpy(seen.opacities).flatten().sigmoid().tolist() == pytest.approx([1, 0], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("smallest", "others", "noted"), [(1e-5, 1e-5, True), (1e-6, 1e-2, False), (1e-4, 1e-4, False)]
+)
+def test_splats_that_become_visibly_thicker_are_noted(smallest: float, others: float, noted: bool) -> None:
+    """A thin axis of a large splat may be thicker."""
+    given = replace(cloud(2), log_scales=torch.tensor([[smallest, others, others], [1.0, 1.0, 1.0]]).log())
+    notes = scale_notes(given)
+    assert bool(notes) == noted
+    assert not noted or notes[0].startswith("50% of the splats are more than 10% too thick")
 
 
 def test_an_empty_cloud_is_a_header(tmp_path: Path) -> None:

@@ -63,6 +63,7 @@ def test_usdskel_moves_the_mesh_as_the_rig_says(skinned: tuple[Path, Asset4D, Ri
         np.testing.assert_allclose(np.array(points)[indices], expected[frame % FRAMES], atol=1e-5)
         low, high = np.array(root.GetExtentAttr().Get(time))
         np.testing.assert_allclose((low, high), (np.min(points, 0), np.max(points, 0)), atol=1e-5)
+    assert root.GetExtentAttr().Get() == root.GetExtentAttr().Get(0)  # also for readers that ignore time
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (24, 24 * FRAMES / FPS)
 
 

@@ -1,5 +1,5 @@
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +7,13 @@ import pytest
 import torch
 import trimesh
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.extraction.density import DensityField, density_field
 from dg4d_lib.mesh.extraction.extract import extract_surface, select_level, usable_level
-from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.rasterizer.interface import Rendering, get_rasterizer
 from dg4d_lib.settings import MeshSettings
 
 SMALL = MeshSettings(grid=64)
@@ -105,6 +107,24 @@ def test_the_best_level_has_the_outline_of_the_gaussians() -> None:
     assert level == pytest.approx(0.5, rel=0.1)
     assert agreement > 0.9
     assert select_level(field, gaussians, rasterize, 0.5)[1] == pytest.approx(0.98, abs=0.02)
+
+
+def test_every_view_is_drawn_once_and_the_input_view_counts_twice() -> None:
+    flat = replace(ball(), log_scales=torch.tensor([[math.log(0.3), math.log(0.2), math.log(0.05)]]))
+    field, drawn = density_field(flat, SMALL), []
+
+    def rasterize(gaussians: Gaussians, cameras: Sequence[OrbitCamera], background: torch.Tensor) -> Rendering:
+        drawn.append((cameras, get_rasterizer("auto")(gaussians, cameras, background)))
+        return drawn[-1][1]
+
+    level, agreement = select_level(field, flat, rasterize, 0.5)
+    ((cameras, render),) = drawn
+    assert len(set(cameras)) == len(cameras)
+    vertices, faces = map(torch.from_numpy, extract_surface(field, level))
+    views = [0, *range(len(cameras))]
+    shown = render.alpha[views, ..., 0] > 0.5
+    covered = rasterize_mesh(vertices, faces, [cameras[view] for view in views]).faces >= 0
+    assert agreement == float((shown & covered).sum() / (shown | covered).sum())
 
 
 def test_a_faint_model_still_gets_a_surface() -> None:

@@ -6,7 +6,8 @@ import torch
 import trimesh
 
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.mesh.render import render_lit, render_mesh
+from dg4d_lib.mesh import render
+from dg4d_lib.mesh.render import LitRenderer, render_lit, render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 
 SIZE = 32
@@ -93,6 +94,32 @@ def test_coordinates_that_are_no_numbers_read_the_first_texel(board: TexturedMes
     for value in (math.nan, -math.inf, -1e30):
         color, alpha = render_mesh(replace(board, uvs=torch.full_like(board.uvs, value)), [CAMERA])
         torch.testing.assert_close(color[alpha[..., 0] == 1].unique(dim=0), torch.tensor([[1.0, 0, 0]]))
+
+
+def test_a_moving_mesh_is_prepared_once_and_drawn_as_afresh(
+    board: TexturedMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It bends, its seam opens, and its texture changes: only then are seams or mip levels found anew."""
+    split = replace(
+        board,
+        vertices=board.vertices[[0, 3, 2, 0, 2, 1]],
+        faces=torch.arange(6, dtype=torch.int32).reshape(2, 3),
+        uvs=board.uvs[[0, 3, 2, 0, 2, 1]],
+    )
+    bend, opening = torch.zeros(2, 6, 3)
+    bend[5], opening[3:] = torch.tensor([0.0, 0.0, 0.2]), torch.tensor([0.1, 0.0, 0.3])
+    states = [replace(split, vertices=split.vertices + share * bend) for share in (0, 1, 2)]
+    states += [replace(split, vertices=split.vertices + opening), replace(split, texture=1 - split.texture)]
+    expected = [render_lit(state, CAMERA) for state in states]
+    calls: list[str] = []
+    for name in ("group_vertices", "mip_levels"):
+        function = getattr(render, name)
+        monkeypatch.setattr(render, name, lambda *given, of=function, by=name: calls.append(by) or of(*given))
+    renderer = LitRenderer()
+    for state, pictures in zip(states, expected, strict=True):
+        for one, other in zip(renderer.render(state, CAMERA), pictures, strict=True):
+            assert torch.equal(one, other)
+    assert calls == ["group_vertices", "mip_levels", "group_vertices", "mip_levels"]
 
 
 def test_light_leaves_no_dark_border() -> None:

@@ -4,9 +4,7 @@ import torch
 import trimesh
 
 from dg4d_lib.geometry.normals import vertex_normals
-from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.atlas_quality import atlas_quality
-from dg4d_lib.mesh.texturing.bake import _fill_texture, locate_texels
+from dg4d_lib.mesh.texturing.bake import fill_texture, locate_texels
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_differences, seam_points
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 
@@ -61,26 +59,9 @@ def test_a_smooth_picture_stays_as_it_is() -> None:
     rest = torch.from_numpy(mesh.vertices.astype(np.float32))
     normals = vertex_normals(rest, faces)[sources]
     texels = locate_texels(rest[sources], normals, corners, uvs, 256)
-    texture = _fill_texture(0.5 + 0.3 * texels.positions, texels, 256)
+    texture = fill_texture(0.5 + 0.3 * texels.positions, texels, 256)
     points = seam_points(rest[sources], corners, uvs, 256)
     level = level_seams(texture, points)
     assert seam_differences(level, points).mean() < 1 / 255
     changed = (level - texture)[texels.rows, texels.columns].abs()
     assert changed.mean() < 2 / 255
-
-
-def test_the_atlas_of_two_squares_is_measured() -> None:
-    vertices, faces, uvs = two_squares()
-    texture = torch.full((SIZE, SIZE, 3), 0.4)
-    texture[:, SIZE // 2 :] = 0.6
-    quality = atlas_quality(TexturedMesh(vertices, faces, uvs, texture))
-    assert (quality.islands, quality.small_islands, quality.mirrored) == (2, 2, 0)
-    assert quality.coverage == pytest.approx(2 * 0.4 * 0.6)
-    assert quality.density_ratio == pytest.approx(1)
-    assert quality.seam_mean == pytest.approx(0.2 * 255)
-    mirrored = uvs.clone()
-    mirrored[4:, 1] = 1 - mirrored[4:, 1]
-    mirrored[4:] = 0.5 * mirrored[4:]
-    quality = atlas_quality(TexturedMesh(vertices, faces, mirrored, texture))
-    assert quality.mirrored == 0.5
-    assert quality.density_ratio == pytest.approx(2)

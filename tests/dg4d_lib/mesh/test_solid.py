@@ -3,7 +3,8 @@ import pytest
 from scipy.ndimage import gaussian_filter, generate_binary_structure, label
 from skimage.measure import euler_number, marching_cubes
 
-from dg4d_lib.mesh.extraction.solid import ambiguous, cavities
+from dg4d_lib.mesh.extraction import solid as module
+from dg4d_lib.mesh.extraction.solid import LEAK, ambiguous, cavities
 from dg4d_lib.mesh.folds import genus
 
 LEVEL = 0.5
@@ -74,3 +75,19 @@ def test_a_room_behind_a_narrow_gap_is_a_cavity_and_an_open_one_is_not() -> None
         low = 12 - width // 2
         opened[low : low + width, low : low + width, 18:] = False
         assert bool(cavities(opened)[12, 12, 12]) is closed
+
+
+@pytest.mark.parametrize("margin", [0, 1, 9])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
+def test_samples_far_from_the_body_are_not_searched_and_hold_no_cavity(
+    margin: int, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    soft = gaussian_filter(np.random.default_rng(0).random((24, 25, 26)), 1.5)
+    solid = np.pad(soft > np.quantile(soft, 1 - share), margin)
+    searched = []
+    whole = module._cavities
+    monkeypatch.setattr(module, "_cavities", lambda part: searched.append(part.shape) or whole(part))
+    found = cavities(solid)
+    np.testing.assert_array_equal(found, whole(solid))
+    assert found.any() == (share > 0)
+    assert all(max(shape) <= 26 + 2 * LEAK for shape in searched)

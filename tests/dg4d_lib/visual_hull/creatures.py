@@ -35,6 +35,14 @@ def creature(shift: tuple[float, float, float] = (0, 0, 0)) -> InflatedSurface:
     return InflatedSurface(every, torch.cat(faces), torch.cat(colors), torch.ones(len(every), dtype=torch.bool))
 
 
+def icosphere(radius: float) -> InflatedSurface:
+    """Return the surface of a gray ball."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    vertices = torch.tensor(ball.vertices).float()
+    gray = torch.full_like(vertices, 0.5)
+    return InflatedSurface(vertices, torch.tensor(ball.faces).long(), gray, torch.ones(len(gray), dtype=torch.bool))
+
+
 def seen(surface: InflatedSurface, azimuth: float, elevation: float = 0.0, size: int = SIZE) -> KnownView:
     """Return the true view of a surface."""
     camera = OrbitCamera(elevation, azimuth, width=size, height=size)

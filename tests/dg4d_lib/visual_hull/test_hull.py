@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from creatures import alpha_of, creature, known_surface, ring, seen
+from creatures import alpha_of, creature, icosphere, known_surface, ring, seen
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.metrics.image import iou
@@ -34,11 +34,8 @@ def test_known_views_are_reproduced_with_their_colors():
 
 
 def test_two_orthogonal_views_of_a_disc_leave_no_corners():
-    ball = creature()
-    small = torch.tensor([0.3, 0.6, 0.3])
-    post = type(ball)(ball.vertices[:642] / torch.tensor([0.22, 0.25, 0.45]) * small, ball.faces[:1280], *(
-        part[:642] for part in (ball.colors, ball.seen)
-    ))  # fmt: skip
+    ball = icosphere(1.0)
+    post = replace(ball, vertices=ball.vertices * torch.tensor([0.3, 0.6, 0.3]))
     views = [seen(post, 0), seen(post, 90)]
     corner = torch.tensor([[0.19, 0.0, 0.19], [0.27, 0.0, 0.0]])  # outside of the round post, and inside
     square, rounded = (hull(views, 64, exponent) for exponent in (50.0, 2.0))
@@ -48,6 +45,17 @@ def test_two_orthogonal_views_of_a_disc_leave_no_corners():
         ) / volume.step
         inside = [bool(volume.values[tuple(cell.round().long().tolist())] > 0) for cell in cells]
         assert inside == [corners_stay, True]
+
+
+@pytest.mark.parametrize("azimuths", [(0, 90), (0, 90, 180, 270), (0, 60, 120)])
+def test_the_hull_of_a_ball_fills_the_silhouettes_that_it_was_carved_from(azimuths):
+    """Its top and bottom lie on the outlines of all views, which count one height once."""
+    ball = icosphere(0.4)
+    views = [seen(ball, azimuth) for azimuth in azimuths]
+    drawn = known_surface(views)
+    for view in views:
+        inside = alpha_of(drawn, view.camera.azimuth_deg)[0, ..., 0] > 0.5
+        assert inside[view.cutout[..., 3] > 0.5].float().mean() > 0.97
 
 
 def test_lenience_widens_the_silhouettes_of_unreliable_views():

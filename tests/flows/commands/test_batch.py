@@ -63,6 +63,7 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
         begun.append(job.item)
         match job.item:
             case "dies" if begun.count("dies") == 1:
+                time.sleep(0.3)
                 raise StepOutOfMemory("fit_motion", "killed")
             case "hopeless":
                 raise StepCrashed("fit_motion", "broken")
@@ -80,7 +81,31 @@ def test_what_died_is_tried_once_more_at_the_end_and_bad_input_is_not(place: Non
         "hopeless": ("failed", 2),
         "fine": ("done", 1),
     }
-    assert "again" not in progress.rows["hopeless"].message
+    assert "retried" not in progress.rows["hopeless"].message
+    assert progress.rows["dies"].wall_s >= 0.3  # of both attempts
+
+
+def test_a_refusal_ends_a_strict_batch_and_leaves_the_reasons_of_crashed_items(
+    place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(job: ConversionJob, folder: Path) -> tuple[None, bool]:
+        if job.item == "dies":
+            raise StepCrashed("fit_motion", "killed by signal 11")
+        return None, False
+
+    refused = {"status": "failed", "kind": NOT_ACCEPTED}
+    monkeypatch.setattr(
+        "flows.catalog.with_verdict", lambda row, *_: row.model_copy(update=refused if row.item == "poor" else {})
+    )
+    progress = BatchProgress(3)
+    todo = jobs(tmp_path, "dies", "poor", "late")
+    inside_a_flow(convert_all, todo, tmp_path, 1, "strict", progress, strict=True, work=work)
+    assert {row.item: (row.status, row.kind, row.attempts) for row in progress.rows.values()} == {
+        "dies": ("failed", "StepCrashed", 1),
+        "poor": ("failed", NOT_ACCEPTED, 1),
+        "late": ("skipped", "", 0),
+    }
+    assert progress.rows["dies"].message == "killed by signal 11 (not retried: poor was not accepted)"
 
 
 def test_items_are_prepared_one_ahead_of_those_at_work(place: None, tmp_path: Path) -> None:
@@ -273,7 +298,7 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.png").write_text(picture("x"))
-    monkeypatch.setattr("flows.catalog_request.is_current", lambda folder, digest: True)
+    monkeypatch.setattr("flows.catalog_request.is_up_to_date", lambda folder, digest: True)
 
     monkeypatch.setattr("flows.convert.connect", lambda: pytest.fail("nothing is to be made"))
     rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET)
@@ -310,6 +335,9 @@ def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, mo
         ([Row(item="a", status="failed", kind="StepCrashed"), Row(item="b", status="done")], 1, "1 of 2 items"),
         ([Row(item="a", status="failed", kind="BadInput"), Row(item="b", status="done")], 1, "1 of 2 items"),
         ([Row(item="a", status="failed", kind="BadInput")], 65, "0 of 1 items"),
+        ([Row(item=kind, status="failed", kind=kind) for kind in ("DiskFull", "StepDiverged")], 65, "0 of 2 items"),
+        ([Row(item="a", status="failed", kind="StepMissing")], 69, "0 of 1 items"),
+        ([Row(item=kind, status="failed", kind=kind) for kind in ("BadInput", "StepMissing")], 1, "0 of 2 items"),
         ([Row(item="a", status="failed", kind="StepCrashed")], 1, "failed: a"),
         ([Row(item="a", status="unchanged")], 0, "nothing to do: every item is up to date"),
     ],

@@ -120,13 +120,17 @@ def test_either_packages_or_a_scene_file_are_needed(shelf: Path, packages: tuple
 @pytest.mark.parametrize(
     ("scene", "said"),
     [
-        ({"items": []}, "items: Tuple should have at least 1 item"),
-        ({"items": [{"package": "gem"}], "lights": 3}, "lights: Extra inputs are not permitted"),
-        ({"items": [{"package": "gem", "sclae": 2}]}, r"items\.0\.sclae: Extra inputs"),
-        ({"items": [{"package": "gem", "scale": 0}]}, r"items\.0\.scale: Input should be greater than 0"),
-        ({"items": [{"package": "gem", "position": [0, 1]}]}, r"items\.0\.position"),
-        ({"items": [{"package": "../gem"}]}, r"items\.0\.package leads outside"),
-        ({"items": [{"package": "/gem"}]}, r"items\.0\.package leads outside"),
+        ({"items": []}, r"items = \[\]: Tuple should have at least 1 item"),
+        (
+            {"items": [{"package": "gem"}], "lights": 3},
+            "the scene has an unknown field 'lights'; allowed: items, duration_s, fps",
+        ),
+        ({"items": [{"package": "gem", "sclae": 2}]}, r"items\[0\] has an unknown field 'sclae'; allowed: .*loop$"),
+        ({"items": [{"name": "gem"}]}, r"items\[0\] has no package, which is required$"),
+        ({"items": [{"package": "gem", "scale": 0}]}, r"items\[0\]\.scale = 0: Input should be greater than 0$"),
+        ({"items": [{"package": "gem", "position": [0, 1]}]}, r"items\[0\]\.position"),
+        ({"items": [{"package": "../gem"}]}, r"items\[0\]\.package leads outside"),
+        ({"items": [{"package": "/gem"}]}, r"items\[0\]\.package leads outside"),
     ],
 )
 def test_what_is_wrong_in_a_scene_file_is_said(shelf: Path, scene: dict[str, object], said: str) -> None:

@@ -34,13 +34,16 @@ def test_the_preview_can_run_here_and_every_line_fits() -> None:
     assert max(map(len, result.stdout.splitlines())) <= 80
 
 
-def test_a_profile_without_its_weights_is_refused_with_the_command() -> None:
+def test_a_profile_without_its_weights_is_refused_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("steps.runtime.readiness._gpu_problem", lambda shown: "the CUDA driver shows no NVIDIA GPU")
     result = dg4d("--profile", "paper")
     assert result.exit_code == 69
     lines = result.stdout.splitlines()
     assert "paper: missing" in lines
     assert "  lacks weights svd" in lines
     assert any(line.endswith("dg4d weights pull paper") for line in lines)
+    assert lines[-1] == "  Without a GPU its networks run on the processor, for days."
+    assert "for days" not in dg4d().stdout
 
 
 def test_an_unknown_profile_is_bad_input() -> None:

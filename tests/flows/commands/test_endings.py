@@ -1,4 +1,4 @@
-"""Signals during a command: lost ones come again, and cleanup is left in peace."""
+"""Endings of a command: exit statuses of errors; lost signals come again, and cleanup is left in peace."""
 
 import os
 import signal
@@ -8,8 +8,13 @@ from collections.abc import Iterator
 import pytest
 import typer
 
+from dg4d_lib.errors import DG4DError
 from flows.commands import endings
-from flows.exit_status import EXIT_HANGUP, EXIT_TERMINATED
+from flows.engine.item_runs import ItemFailed
+from flows.exit_status import EXIT_FAILED, EXIT_HANGUP, EXIT_STATUS, EXIT_TERMINATED
+from flows.serving.server import ServerUnavailable
+from flows.step_errors import StepError
+from flows.studio.drafts import TooLarge
 
 
 @pytest.fixture(autouse=True)
@@ -46,3 +51,16 @@ def test_reminders_and_further_signals_do_not_interrupt_the_cleanup() -> None:
             time.sleep(0.3)
             cleaned = True
     assert cleaned
+
+
+def test_an_item_of_several_has_the_exit_status_that_its_error_has_alone() -> None:
+    assert TooLarge in of_ours(DG4DError)
+    for kind in {*of_ours(DG4DError), *of_ours(StepError), ServerUnavailable} - {ItemFailed}:
+        error = kind("fit", "why") if issubclass(kind, StepError) else kind.__new__(kind, "why")
+        assert endings._describe(error)[1] == EXIT_STATUS.get(kind.__name__, EXIT_FAILED), kind
+
+
+def of_ours(kind: type[Exception]) -> set[type[Exception]]:
+    """List our subclasses of an exception, at any depth."""
+    below = {one for one in kind.__subclasses__() if one.__module__.startswith(("dg4d_lib.", "steps.", "flows."))}
+    return below.union(*map(of_ours, below))

@@ -12,6 +12,7 @@ from flows.commands.terminal import (
     numbers,
     print_package,
     print_rows,
+    print_tables,
     steps_shown,
 )
 from flows.engine.events import StepEvent, emit
@@ -52,6 +53,15 @@ def test_rows_stand_in_columns_and_words_in_brackets_stay():
     screen = io.StringIO()
     print_rows(Console(file=screen, width=200), [("a", "whole", ""), ("asset.glb", "altered", "[why]")])
     assert screen.getvalue() == "a          whole\nasset.glb  altered  [why]\n"
+
+
+def test_tables_for_programs_are_not_wrapped(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    name = "n" * 120
+    print_tables(console(), [("objects", [{"object": name, "psnr": "1.0"}])])
+    print_package(console(), Path("out"), {name: 1})
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines if "nn" in line] == [name, name]
 
 
 def test_a_long_batch_shows_what_runs_and_what_failed_last_and_no_more_than_fits():

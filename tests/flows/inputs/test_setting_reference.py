@@ -44,6 +44,7 @@ def test_every_value_of_a_profile_is_in_the_reference(name: str) -> None:
         ("prior.wieghts", "did you mean prior.weights?"),
         ("iterations", "iterations?"),
         ("max_faces", "did you mean mesh.max_faces?"),
+        ("motion.motion", "did you mean driving.motion?"),
         ("qqq", "`dg4d settings` lists the names"),
     ],
 )
@@ -51,6 +52,21 @@ def test_a_misspelt_setting_gets_the_nearest_name_and_no_list(given: str, neares
     with pytest.raises(BadInput) as caught:
         parse_changes([f"{given}=1"])
     assert nearest in str(caught.value) and len(str(caught.value)) < 150
+
+
+@pytest.mark.parametrize(
+    ("given", "example"),
+    [
+        ("driving=wave", "driving.motion=wave"),
+        ("motion=wave", "driving.motion=wave"),
+        ("static.start=blob", "static.start.kind=blob"),
+        ("score=3", "score."),
+    ],
+)
+def test_a_group_of_settings_takes_no_single_value(given: str, example: str) -> None:
+    with pytest.raises(BadInput, match=f"is a group of settings; name one, for example {example}.*lists them$"):
+        parse_changes([given])
+    assert parse_changes(['driving={"kind":"svd"}']) == {"driving": {"kind": "svd"}}
 
 
 def test_old_names_pass_to_the_message_that_explains_them() -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from dg4d_lib.errors import BadInput
+from flows.engine.output_lock import is_up_to_date
 from flows.inputs.package_record import record_of
-from flows.packages.publish import Files, check_folder, is_current, publish, replace_package
+from flows.packages.publish import Files, check_folder, is_current, publish
 from flows.packages.verify import verify
 from steps.store.files import DiskFull
 
@@ -135,16 +136,6 @@ def test_a_folder_that_cannot_be_renamed_is_filled_in_place(
     assert is_current(out, "o1")
 
 
-@pytest.mark.parametrize("others", [False, True], ids=["alone", "beside a file of the user"])
-def test_undo_removes_the_parent_folders_that_were_created(package: Path, tmp_path: Path, others: bool) -> None:
-    swap = replace_package(package, tmp_path / "made" / "too" / "out", finish)
-    if others:
-        (tmp_path / "made" / "notes.txt").write_text("mine")
-    swap.undo()
-    assert (tmp_path / "made").exists() == others
-    assert not (tmp_path / "made" / "too").exists()
-
-
 def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     publish(package, out, finish)
@@ -155,6 +146,23 @@ def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp
     publish(package, out, finish)
     assert tree(out)["notes.txt"] == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "package.zip"]
+
+
+@pytest.mark.parametrize("place", ["", "out"], ids=["beside the folder", "in the folder"])
+def test_a_package_that_is_up_to_date_gets_back_the_users_files_that_a_killed_command_left_aside(
+    package: Path, tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    out, dead = tmp_path / "out", 2**22 + 1
+    publish(package, out, finish)
+    left = tmp_path / place / f".out.outgoing-{dead}"
+    publish(package, left, finish)
+    (left / "notes.txt").write_text("mine")
+    (tmp_path / place / f".out.incoming-{dead}").mkdir()
+    assert not is_up_to_date(out, "o2") and left.exists()
+    assert is_up_to_date(out, "o1") and is_up_to_date(out, "o1")
+    assert tree(out)["notes.txt"] == "mine"
+    assert [path.name for path in (tmp_path / place).glob(".out.*")] == []
 
 
 def test_what_a_killed_process_of_the_same_number_left_does_not_block(package: Path, tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def test_objects_may_be_called_anything() -> None:
     assert all(float(line["psnr"]) for line in csv.DictReader(StringIO(csv_text(one))))
 
 
-def test_the_exit_code_says_whether_bad_input_is_to_blame_for_all() -> None:
+def test_the_exit_code_is_that_of_all_objects_or_1() -> None:
     good, bad, broken = (
         ObjectScores(object="a", rows={"video": ours(2.0)}),
         ObjectScores(object="b", error="x", kind="StepBadInput"),

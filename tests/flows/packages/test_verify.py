@@ -39,7 +39,7 @@ def faults(verdict: Verification) -> dict[str, str]:
 def test_a_package_as_it_was_made_is_whole(package: Path) -> None:
     verdict = verify(package)
     assert verdict.exit_code == 0
-    assert list(verdict.rows()) == [("10 files", "whole", ""), ("4 records of steps", "whole", "")]
+    assert list(verdict.rows()) == [("10 files", "unchanged", ""), ("4 step records", "unchanged", "")]
 
 
 def test_a_changed_byte_in_any_file_is_noticed_and_the_file_named(package: Path) -> None:

@@ -103,8 +103,8 @@ def test_numbers_out_of_range_are_no_form(field: dict[str, Any]) -> None:
 def test_what_a_form_asks_for_reaches_the_knobs() -> None:
     filled = {"triangles": 400, "fps": None, "motion": "wave", "settings": ["mesh.max_faces=7", "subject.size = 64"]}
     options = deployments.PictureOptions.model_validate(filled)
-    assert options.knobs() == {"mesh.max_faces": 400, "driving.motion": "wave", "subject.size": 64}
-    assert revise(PREVIEW, options.knobs()).driving.motion == "wave"  # type: ignore[union-attr]
+    assert options.changes() == {"mesh.max_faces": 400, "driving.motion": "wave", "subject.size": 64}
+    assert revise(PREVIEW, options.changes()).driving.motion == "wave"  # type: ignore[union-attr]
 
 
 def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:

@@ -270,7 +270,7 @@ def test_folders_of_weights_elsewhere_are_refused(place: Path, setting: str) -> 
 
 @pytest.mark.parametrize("name", ["zero123-xl", "somebody/pictures", "{place}/in/mine", "{place}/home/weights/lgm", ""])
 def test_weights_by_name_in_a_root_and_in_the_folder_of_weights_may_be_named(place: Path, name: str) -> None:
-    Roots.of_this_process().check_knobs({"prior.weights": name.format(place=place)})
+    Roots.of_this_process().check_settings({"prior.weights": name.format(place=place)})
 
 
 # Outputs

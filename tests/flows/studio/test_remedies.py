@@ -30,7 +30,20 @@ def test_a_remedy_goes_to_the_side_on_which_the_value_is_missing() -> None:
     low, high = (remedies(gate("motion", side), settings)[0].changes for side in (True, False))
     assert low == {"motion.iterations": 500}
     assert set(high) == {"motion.plane_lr", "motion.network_lr"}
-    assert remedies({**gate("agreement", True)}, settings)[0].lines() == ["mesh.density_threshold=0.25"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({}, "mesh.source=gaussians"),  # the network's surface has no threshold
+        ({"mesh.source": "gaussians"}, "mesh.density_threshold=0.25"),
+        ({"mesh.mode": "per_frame"}, "mesh.density_threshold=0.25"),
+    ],
+)
+def test_the_threshold_is_a_remedy_for_surfaces_of_gaussians_alone(changes: dict[str, str], line: str) -> None:
+    settings = revise(profile("preview"), changes)
+    assert remedies(gate("agreement", True), settings)[0].lines() == [line]
+    assert remedies(gate("flaws", False), settings)[0].lines() == [line]
 
 
 def test_what_passed_needs_none_and_a_value_at_its_bound_is_left_out() -> None:

@@ -1,4 +1,4 @@
-"""Orders of the studio, without a server."""
+"""Conversions that the studio starts, without a server."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -16,7 +16,7 @@ from flows.serving.roots import Roots
 from flows.studio import quick
 from flows.studio.drafts import Draft, Upload
 from flows.studio.pages import DESCRIPTIONS
-from flows.studio.submission import Submission, order
+from flows.studio.submission import Submission, convert
 from steps.profiles import PROFILES
 
 
@@ -46,7 +46,7 @@ def test_the_page_offers_every_profile() -> None:
 def test_a_batch_makes_an_asset_of_every_file_whatever_its_suffix(draft: Draft) -> None:
     for name in ("fox.png", "fox.jfif", "IMG_0001", "manifest.csv"):
         receive(draft, name, PNG)
-    parameters = order(draft, Submission(batch=True)).parameters
+    parameters = convert(draft, Submission(batch=True)).parameters
     receive(draft, "later.png", PNG)
     roots = Roots.of_this_process()
     items = items_of(roots.inputs(parameters["inputs"]), Path(parameters["out"]), "preview", {}, 0)

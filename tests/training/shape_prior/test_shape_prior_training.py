@@ -61,7 +61,7 @@ def test_a_gpu_trains_as_the_processor_does(tmp_path: Path) -> None:
         losses[device.type] = [float(run.step(batch)["occupancy"]) for batch in made]
         run.save(tmp_path)
     assert losses["cuda"] == pytest.approx(losses["cpu"], rel=0.03)
-    resumed = training.Run.load(tmp_path, plan(48))  # on the processor what the GPU left
+    resumed = training.Run.load(tmp_path)  # on the processor what the GPU left
     assert resumed.shown == 48
     assert resumed.network.stem.weight.device.type == "cpu"
 
@@ -74,7 +74,7 @@ def test_a_run_that_was_stopped_gives_the_same_weights(tmp_path: Path) -> None:
         part.step(make_batch(1, number, 4, 256))
     (tmp_path / "parts").mkdir()
     part.save(tmp_path / "parts")
-    resumed = training.Run.load(tmp_path / "parts", plan(32))
+    resumed = training.Run.load(tmp_path / "parts")
     assert resumed.shown == 16
     training.train(resumed, tmp_path / "parts", workers=0, every=16)
     for name, value in whole.network.state_dict().items():
@@ -87,7 +87,78 @@ def test_a_run_that_is_asked_to_stop_saves_where_it_stands(tmp_path: Path) -> No
     stop = Event()
     stop.set()
     training.train(training.Run(plan(32, held_out=1), TINY), tmp_path, workers=0, stop=stop)
-    assert training.Run.load(tmp_path, plan(32)).shown == 4
+    assert training.Run.load(tmp_path).shown == 4
+
+
+@pytest.fixture
+def process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the trainer from changing this process."""
+    monkeypatch.setattr(training, "keep_freed_memory", lambda: None)
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", lambda _: None)
+    monkeypatch.setattr(training.signal, "signal", lambda *_: None)
+
+
+@pytest.mark.usefixtures("process")
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ("--samples 15", "--samples is 15, less than one batch. Give at least --batch (16)."),
+        ("--batch 0", "--batch is 0. Give at least 1."),
+        ("--threads 0", "--threads is 0. Give at least 1."),
+        ("--every 0", "--every is 0. Give at least 1."),
+        ("--warmup 0", "--warmup is 0. Give at least 1."),
+        ("--cooldown 0", "--cooldown is 0.0. Give more than 0 and at most 1."),
+        ("--rays 0", "--rays is 0. Give at least 1."),
+        ("--lr nan", "--lr is nan. Give more than 0."),
+        ("--workers=-1", "--workers is -1. Give at least 0."),
+        ("--seed=-1", "--seed is -1. Give at least 0."),
+    ],
+)
+def test_an_option_out_of_its_range_is_refused_by_name(
+    given: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        training.main([str(tmp_path / "run"), *given.split()])
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("process")
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ("--lr 0.1", "other settings than those given: --lr (0.004)."),
+        ("--seed 2 --batch 4", "--seed (1)."),
+        ("--batch 8 --layers 2", "--batch (4), --layers (1)."),
+        ("--widths 8 16 32 64", "--widths ([8, 16, 32, 32])."),
+        ("--warm-start other.safetensors", "--warm-start is for new runs;"),
+        ("--samples 3", "--samples is 3, but"),
+    ],
+)
+def test_a_run_that_goes_on_refuses_other_settings(
+    given: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = training.Run(plan(32), TINY)
+    run.shown = 4
+    run.save(tmp_path)
+    with pytest.raises(SystemExit):
+        training.main([str(tmp_path), *given.split()])
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("process")
+@pytest.mark.parametrize(
+    ("given", "samples"), [("", 32), ("--samples 800", 800), ("--lr 0.004 --widths 8 16 32 32 --seed 1", 32)]
+)
+def test_a_run_goes_on_with_its_own_settings(
+    given: str, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training.Run(plan(32), TINY).save(tmp_path)
+    plans: list[training.Plan] = []
+    monkeypatch.setattr(training, "train", lambda run, *_, **__: plans.append(run.plan))
+    training.main([str(tmp_path), *given.split()])
+    assert plans == [plan(samples)]
 
 
 @pytest.mark.slow

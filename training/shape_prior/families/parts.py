@@ -31,15 +31,15 @@ def curve(start: Point, yaw: float, pitch: float, length: float, bends: Sequence
     return points
 
 
-def taper(first: float, last: float, count: int, power: float = 1.0) -> list[float]:
+def taper(first: float, last: float, count: int) -> list[float]:
     """Return `count` radii from the first to the last."""
-    return [last + (first - last) * (1 - i / max(1, count - 1)) ** power for i in range(count)]
+    return [last + (first - last) * (1 - i / max(1, count - 1)) for i in range(count)]
 
 
 def limb(
     shape: Shape, start: Point, lengths: Sequence[float], radii: Sequence[float], swings: Sequence[float],
     lean: float = 0.0, materials: Sequence[int] = (MAIN,), foot: Foot = "none", foot_size: float = 0.05,
-    foot_material: int = SECOND, flat: float = 1.0,
+    foot_material: int = SECOND,
 ) -> Vector:  # fmt: skip
     """Add a jointed limb and return its end.
 
@@ -54,7 +54,6 @@ def limb(
         foot: what is at its end.
         foot_size: object units.
         foot_material: of the foot.
-        flat: thickness of the segments in proportion to their width.
     """
     point = np.asarray(start, float)
     for i, (length, swing) in enumerate(zip(lengths, swings, strict=True)):
@@ -62,7 +61,7 @@ def limb(
         step = [math.sin(out), -math.cos(out) * math.cos(swing), math.cos(out) * math.sin(swing)]
         following = point + length * np.array(step)
         material = materials[min(i, len(materials) - 1)]
-        shape.cone(point, following, radii[i], radii[i + 1], material, flat)
+        shape.cone(point, following, radii[i], radii[i + 1], material)
         point = following
     add_foot(shape, point, foot, foot_size, radii[-1], foot_material)
     return point
@@ -118,11 +117,11 @@ def mouth(chance: Chance, shape: Shape, center: Vector, radii: Vector, turn: Mat
     shape.ellipsoid(place, half, turn.T, chance.pick((DARK, ACCENT)), operation=PAINT)
 
 
-def ears(chance: Chance, shape: Shape, center: Vector, radius: float, turn: Matrix, material: int = MAIN) -> None:
+def ears(chance: Chance, shape: Shape, center: Vector, radius: float, turn: Matrix) -> None:
     """Add a pair of ears, horns or antlers to a head."""
     kind = chance.pick(("pointed", "round", "hanging", "long", "horns", "antlers", "none"), (5, 4, 3, 2, 2, 1, 2))
     start = len(shape.solids)
-    h, inner = radius, chance.pick((material, SECOND, ACCENT))
+    h, inner = radius, chance.pick((MAIN, SECOND, ACCENT))
 
     def at(x: float, y: float, z: float) -> Vector:
         return center + turn @ (np.array([x, y, z]) * h)

@@ -1,0 +1,104 @@
+"""Colors of the far side of a symmetric mesh, taken in full detail from its near side across the mirror plane.
+
+A texel that no frame shows takes the color that the input view shows at its mirror image, where there is a surface.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.mesh.render import render_mesh, smooth_normals
+from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.texturing.bake import (
+    INPUT_FLATTER,
+    MIN_COSINE,
+    OUTLINE,
+    PosedSurface,
+    Texels,
+    add_views,
+    covered_texels,
+    fill_texture,
+    grade_pixels,
+    placed_texels,
+)
+from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
+from dg4d_lib.shape_prior.mirror import MirrorPlane
+
+REACH = 0.12  # world units along a ray of the input camera: a mirror image further from the surface shows nothing
+SHOWN = 10.0  # weight of colors that frames show, relative to that of a mirror image
+GUESSED = 0.01  # weight of other colors; mirror images that are seen at grazing angles give way to them
+FLATTEST = INPUT_FLATTER * MIN_COSINE  # cosine below which a mirror image is not seen
+
+
+def mirror_texture(
+    mesh: TexturedMesh, footage: Sequence[PosedSurface], plane: MirrorPlane
+) -> tuple[Float[Tensor, "h w 3"], float]:
+    """Color what no frame shows by the mirror image of what the input view shows.
+
+    Args:
+        mesh: with the texture to change.
+        footage: its surface at frames of the driving video, split along seams as the mesh.
+        plane: mirror plane of the mesh.
+
+    Returns:
+        The texture, in [0, 1], equal on both sides of a seam; and the share of the surface's texels that have the color
+        of a mirror image.
+    """
+    size = len(mesh.texture)
+    covered = covered_texels(mesh.faces, mesh.uvs, size)
+    texels = placed_texels(*covered, mesh.vertices, smooth_normals(mesh))
+    camera = OrbitCamera(width=size, height=size)
+    color, alpha = render_mesh(mesh, [camera], supersampling=1)
+    view = grade_pixels(color, alpha[..., 0], [camera], mesh.vertices, mesh.faces, OUTLINE)
+    images, nearness = _on_surface(_mirrored(texels, plane), camera, view[2][0])
+    mirrored = np.zeros((len(nearness), 4), np.float32)
+    add_views(images, [camera], view, [(FLATTEST, 1.0)], mirrored)
+    weight = nearness * torch.from_numpy(mirrored[:, 3])
+    found = (weight > 0).nonzero()[:, 0]
+    shown = _weights_of(footage, [part[found] for part in covered], mesh.faces)
+    share = plane.trust * weight[found] / (weight[found] + SHOWN * shown + GUESSED)
+    colors = mesh.texture[texels.rows, texels.columns]
+    taken = torch.from_numpy(mirrored[found, :3] / mirrored[found, 3:])
+    colors[found] = torch.lerp(colors[found], taken, share[:, None])
+    texture = level_seams(fill_texture(colors, texels, size), seam_points(mesh.vertices, mesh.faces, mesh.uvs, size))
+    return texture, int((share > 0.5).sum()) / max(1, len(colors))
+
+
+def _weights_of(
+    footage: Sequence[PosedSurface], covered: Sequence[Tensor], faces: Int[Tensor, "f 3"]
+) -> Float[Tensor, " p"]:
+    """Return the weights that frames have in some texels, summed over frames; see `covered_texels`."""
+    total = np.zeros((len(covered[0]), 4), np.float32)
+    for posed in footage:
+        camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
+        pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, 1)
+        moved = placed_texels(*covered, posed.vertices, posed.normals)
+        add_views(moved, [camera], pictures, [(FLATTEST, posed.weight)], total)
+    return torch.from_numpy(total[:, 3])
+
+
+def _mirrored(texels: Texels, plane: MirrorPlane) -> Texels:
+    return replace(texels, positions=plane.places(texels.positions), normals=plane.directions(texels.normals))
+
+
+def _on_surface(texels: Texels, camera: OrbitCamera, depth: Float[Tensor, "h w"]) -> tuple[Texels, Float[Tensor, " p"]]:
+    """Return texels moved along the rays of a camera onto the surface that it sees, and how near they were, in [0, 1].
+
+    Args:
+        texels: near the surface, or not.
+        camera: the camera.
+        depth: camera z of the surface in every pixel, infinite where there is none.
+    """
+    view, eye = camera.viewmat().float(), camera.position().float()
+    x, y, z = (texels.positions @ view[:3, :3].T + view[:3, 3]).T
+    column = (camera.focal * x / z + camera.width / 2).long().clamp(0, camera.width - 1)
+    row = (camera.focal * y / z + camera.height / 2).long().clamp(0, camera.height - 1)
+    onto = depth[row, column]
+    nearness = (1 - ((onto - z) / REACH).square()).clamp(min=0)
+    stretch = torch.where(nearness > 0, onto / z, 1.0)[:, None]
+    return replace(texels, positions=eye + (texels.positions - eye) * stretch), nearness
