@@ -23,9 +23,9 @@ def photographs(size: int) -> dict[str, Backdrop]:
     return {name: _central_square(getattr(data, name)(), size) for name in PHOTOGRAPHS}
 
 
-def procedural(size: int, seed: int = 0) -> dict[str, Backdrop]:
-    """Return twenty backdrops, from plain to busy; equal seeds give equal pictures."""
-    random = np.random.default_rng(seed)
+def procedural(size: int) -> dict[str, Backdrop]:
+    """Return twenty backdrops, from plain to busy, the same in every call."""
+    random = np.random.default_rng(0)
     y, x = np.mgrid[-1 : 1 : size * 1j, -1 : 1 : size * 1j]
 
     def clouds(scale: float, octaves: int = 4) -> ndarray:

@@ -40,7 +40,7 @@ ERRORS = OraclePriorSettings(blur=1.0, color_gain=0.05, pose_deg=3.0, shift=2.0)
 WITHOUT_MODELS = {"driving.kind": "warp", "views.kind": "none"}
 
 
-def imperfect_bank(subject: Subject, errors: OraclePriorSettings, spoil: int = 0, seed: int = 0) -> Bank:
+def imperfect_bank(subject: Subject, errors: OraclePriorSettings, spoil: int = 0) -> Bank:
     """Return views of frame 0 from eight azimuths and two elevations, with errors; of the input, only from above."""
     assert subject.truth is not None and subject.truth.bank is not None, f"{subject.name} has no bank"
     folder, bank = subject.truth.inputs[0].parents[1] / "static", read_bank_folder(subject.truth.bank)
@@ -57,8 +57,8 @@ def imperfect_bank(subject: Subject, errors: OraclePriorSettings, spoil: int = 0
             picture = resize(bank.pictures[row, first][None].float() / 255, (SIZE, SIZE))[0]
             pairs.append((replace(camera, width=SIZE, height=SIZE), picture))
     pictures = torch.stack([(picture.clamp(0, 1) * 255).round().to(torch.uint8) for _, picture in pairs])[:, None]
-    found = perturb(Bank(tuple(camera for camera, _ in pairs), (0,), pictures), errors, _generator(seed))
-    for index in torch.randperm(len(pairs), generator=_generator(seed + 1))[:spoil].tolist():
+    found = perturb(Bank(tuple(camera for camera, _ in pairs), (0,), pictures), errors, _generator(0))
+    for index in torch.randperm(len(pairs), generator=_generator(1))[:spoil].tolist():
         found.pictures[index] = found.pictures[index].flip(1)
     return found
 

@@ -27,7 +27,7 @@ from torch.nn.functional import interpolate
 from trimesh.creation import icosphere
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.animated import Asset4D, states_between
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -41,7 +41,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from flows.packages.publish import load_verified
 from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.packages import SUBJECT, read_manifest
-from steps.artifacts.rendering import read_states, read_surface, states_between
+from steps.artifacts.rendering import read_states, read_surface
 from steps.check_asset import LoadedAsset, collect_evidence
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore

@@ -50,12 +50,11 @@ class Row:
     agreement: float
 
 
-def measure_matting(folder: Path, frames: Iterable[int] = (0,), objects: Iterable[str] = ()) -> list[Row]:
+def measure_matting(folder: Path, objects: Iterable[str] = ()) -> list[Row]:
     """Measure all objects of a folder over all backdrops.
 
     Args:
         folder: with a folder per object.
-        frames: numbers of the pictures that are used.
         objects: names to measure; empty: all.
 
     Raises:
@@ -66,11 +65,10 @@ def measure_matting(folder: Path, frames: Iterable[int] = (0,), objects: Iterabl
         path
         for place in sorted(folder.iterdir())
         if not wanted or place.name in wanted
-        for frame in frames
-        if (path := place / "input" / f"{frame:03d}.png").is_file()
+        if (path := place / "input" / "000.png").is_file()
     ]
     if not paths:
-        raise BadInput(f"{folder} has no object with pictures input/NNN.png; give a folder with a folder per object")
+        raise BadInput(f"{folder} has no object with a picture input/000.png; give a folder with a folder per object")
     return [row for path in paths for row in _rows(path.parts[-3], read_png(path))]
 
 

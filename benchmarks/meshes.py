@@ -15,11 +15,11 @@ import numpy as np  # isort: skip
 import torch
 from rich.table import Table
 
+from benchmarks.atlas_quality import AtlasQuality, atlas_quality
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.placement import Surface
 from dg4d_lib.mesh.extraction.topology import join_seams
 from dg4d_lib.mesh.folds import SurfaceDefects, genus, surface_defects
-from dg4d_lib.mesh.texturing.atlas_quality import AtlasQuality, atlas_quality
 from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import mesh_at, read_surface
 

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, moved_pieces
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, moved_pieces, read_foreign_glb
 from dg4d_lib.assets.formats.gltf import read_accessor
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -38,11 +38,20 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.animate_asset import controlled, moved_vertices
 from steps.prepare_asset import cover, posed_model
 from steps.profiles import PREVIEW, revise
-from steps.sources.models import read_mesh
+from steps.sources.models import embed_files
 
 AZIMUTHS = (-75.0, 15.0, 105.0, 195.0)
 SPAN = 0.75  # of the frame, that the animation fills
 DRAWN = 2 * SIZE  # pixels of the video
+
+
+def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
+    """Read a GLB or glTF beside its files.
+
+    Raises:
+        BadInput: it cannot be used.
+    """
+    return read_foreign_glb(embed_files(path), settings.max_faces)
 
 
 def played(glb: ForeignGlb, animation: str, frames: int) -> Float[np.ndarray, "t v 3"]:

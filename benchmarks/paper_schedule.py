@@ -178,9 +178,10 @@ class Schedule:
         assert isinstance(driving, SvdSettings) and isinstance(refiner, VideoToVideoSettings)
         assert isinstance(prior_settings, Zero123PriorSettings)
         motion = self.video_model(driving.model, clock)
-        row, video = self.measured("video", clock, lambda: StableVideo(driving, motion).generate(subject, seeded()))
+        maker = StableVideo(driving, motion)
+        row, (video,) = self.measured("video", clock, lambda: maker.generate_all(subject, [seeded()]))
         yield row
-        del motion
+        del motion, maker
         prior = self.zero123(prior_settings)
         row, gaussians = self.measured("static", clock, lambda: self.fit(prior, subject, clock))
         yield row
@@ -332,8 +333,9 @@ def disc(size: int) -> torch.Tensor:
     return torch.stack([(rows + 1) / 2, (columns + 1) / 2, 0.4 * inside, inside], -1)
 
 
-def ball(texture: int, device: torch.device, rows: int = 100, columns: int = 200) -> TexturedMesh:
+def ball(texture: int, device: torch.device) -> TexturedMesh:
     """Return a gray sphere with about as many triangles as an extracted mesh."""
+    rows, columns = 100, 200
     down, around = torch.linspace(0, 1, rows), torch.linspace(0, 1, columns)
     v, u = (place.flatten() for place in torch.meshgrid(down, around, indexing="ij"))
     polar, azimuth = torch.pi * v, 2 * torch.pi * u

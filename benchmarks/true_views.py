@@ -81,16 +81,15 @@ def hint_of(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> De
     return DepthHint(settings.subject.turn_deg or found)
 
 
-def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None) -> Gaussians:
+def fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None) -> Gaussians:
     """Fit Gaussians and their motion to the footage; return their states at all frames.
 
     Args:
         subject: footage and true views.
         settings: of the pipeline.
-        seed: of all randomness.
         sides: known views beside the input.
     """
-    rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(seed)
+    rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
     cutouts = prepared(subject, settings)
     hint, start_settings = hint_of(cutouts, settings), settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
@@ -111,15 +110,13 @@ def fit(subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank
         return deformation.displace(fitted.means, torch.linspace(0, 1, len(video))).apply(fitted)
 
 
-def score_fit(
-    subject: Subject, settings: PipelineSettings, seed: int = 0, sides: Bank | None = None
-) -> tuple[Figures, Tensor]:
+def score_fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None) -> tuple[Figures, Tensor]:
     """Fit as `fit` does; compare views of all frames with the true ones.
 
     Returns:
         Figures, and unseen views side by side over white: the fit's above the true ones.
     """
-    rasterize, moved = get_rasterizer("auto"), fit(subject, settings, seed, sides)
+    rasterize, moved = get_rasterizer("auto"), fit(subject, settings, sides)
     cutouts, rows, strips = prepared(subject, settings), [], []
     picked = torch.linspace(0, len(cutouts) - 1, SHOWN).round().long()
     with torch.no_grad():

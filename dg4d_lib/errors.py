@@ -6,6 +6,8 @@ DG4DError
 └── FitDiverged           non-finite loss, or a model without Gaussians
 """
 
+MAX_QUOTED = 80  # characters of a value in a message
+
 
 class DG4DError(Exception):
     """Base class of errors with a message for the user."""
@@ -21,3 +23,9 @@ class BackendUnavailable(DG4DError):
 
 class FitDiverged(DG4DError):
     """Diverged optimization; the message names the stage, the iteration and the value."""
+
+
+def quoted(value: object) -> str:
+    """Return the `repr` of a value for a message, shortened to `MAX_QUOTED` characters."""
+    text = repr(value)
+    return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."

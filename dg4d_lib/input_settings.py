@@ -53,7 +53,11 @@ class SubjectSettings(Settings):
         0.2, ge=0, lt=0.9, description="margin around a centered subject, fraction of the frame (paper's code)"
     )
     turn_deg: float = Field(
-        0.0, ge=-60, le=60, description="rotation of the subject away from the camera; a user's hint"
+        0.0,
+        ge=-60,
+        le=60,
+        description="degrees that the subject is turned about the vertical; positive: the right side of the picture is "
+        "nearer; 0: not known, see ground_turn",
     )
     ground_turn: float = Field(
         0.6, ge=0, le=1, description="factor on the turn that the ground line of footage gives if `turn_deg` is 0"

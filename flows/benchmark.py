@@ -1,7 +1,6 @@
 """Flow that scores finished assets against their ground truth and shows the means as a table in the Prefect UI."""
 
-import json
-from typing import Any, Literal
+from typing import Literal
 
 from prefect import flow
 from prefect.artifacts import create_table_artifact
@@ -56,6 +55,7 @@ def score_assets(
     films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]] = {}
     missing: dict[str, str] = {}
     clips: dict[str, list[list[float]]] = {"truth": [], "ours": []}
+    store = home.store()
     for entry in entries:
         one = ObjectScores(object=entry.name, error=entry.error, kind=entry.kind, seconds=entry.seconds)
         if entry.package is not None:
@@ -67,7 +67,7 @@ def score_assets(
             except StepError as error:
                 one = one.model_copy(update={"error": error.message, "kind": type(error).__name__})
             else:
-                theirs, mine = _read(baselines["scores"]), _read(asset["scores"])
+                theirs, mine = store.load_json(baselines["scores"]), store.load_json(asset["scores"])
                 films[entry.name] = {"truth": baselines["films"], "ours": asset["films"]}
                 missing |= mine["missing"]
                 clips["truth"] += theirs["clips"].values()
@@ -90,11 +90,6 @@ def score_assets(
     )
     create_table_artifact(table=scores.table(results), key="benchmark", description=markdown(title))
     return BenchmarkResult(results=results, films=films)
-
-
-def _read(ref: ArtifactRef) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads(home.store().path(ref).read_text(encoding="utf-8"))
-    return report
 
 
 def _fvd(clips: dict[str, list[list[float]]], missing: str) -> tuple[scores.Figures, dict[str, str]]:

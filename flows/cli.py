@@ -394,7 +394,7 @@ def compose(
         Path | None, typer.Option(metavar="FILE", help="JSON file with positions and start times of the assets")
     ] = None,
     spacing: Annotated[
-        float, typer.Option(min=0, max=1000, metavar="X", callback=finite, help="world units between neighbors")
+        float, typer.Option(min=0, max=1000, metavar="X", callback=finite, help="meters between neighbors")
     ] = 0.25,
     preview: Annotated[bool, typer.Option("--preview", help="also render a video of the scene")] = False,
 ) -> None:

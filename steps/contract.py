@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
+from dg4d_lib.errors import quoted
+
 CONTRACT_VERSION = 1
 LARGEST_SEED = 2**63 - 1  # limit of torch's generators
-SHOWN = 80  # characters of a value in a message
 
 FailureKind = Literal["bad_input", "missing", "lost", "unreachable", "diverged", "out_of_memory", "crashed"]
 
@@ -173,7 +174,7 @@ def settings_errors(error: ValidationError, given: Any = None) -> str:
     lines = []
     for each in error.errors():
         name = _setting_name(each["loc"], given)  # empty if all settings together are refused
-        lines.append(f"{name} = {shown(each['input'])}: {each['msg']}" if name else each["msg"])
+        lines.append(f"{name} = {quoted(each['input'])}: {each['msg']}" if name else each["msg"])
     return "; ".join(lines)
 
 
@@ -188,12 +189,6 @@ def _setting_name(location: tuple[int | str, ...], given: Any) -> str:
         given = given.get(part) if isinstance(given, dict) else None
         kind = given.get("kind") if isinstance(given, dict) else None
     return ".".join(names)
-
-
-def shown(value: Any) -> str:
-    """Return the `repr` of a value, shortened for a message."""
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def is_digest(text: str) -> bool:

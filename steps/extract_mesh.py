@@ -121,8 +121,8 @@ def run(job: Job) -> StepReport:
         BadInput: the motion does not have these frames.
     """
     plan = read_plan(job.inputs["plan"])
-    settings: MeshSettings = job.settings.mesh
-    settings = settings.model_copy(update={"grid": plan.grid or settings.grid})
+    given: MeshSettings = job.settings.mesh
+    settings: MeshSettings = given.model_copy(update={"grid": plan.grid or given.grid})
     frames_of_task: FrameRange = job.settings
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])

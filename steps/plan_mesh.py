@@ -76,7 +76,9 @@ def run(job: Job) -> StepReport:
             notes.append(
                 f"thin parts: the density field has {grid} samples along every axis (mesh.grid={settings.grid})"
             )
-    notes.append(f"surface at density {level:.3g}; its outlines agree with the Gaussians' to {agreement:.1%} (IoU)")
+    guessed = settings.source == "prior" and {"driving_video", "subject"} <= job.inputs.keys()
+    if mode == "per_frame" or not guessed:  # else the mesh is the shape network's surface
+        notes.append(f"outlines of the isosurface at density {level:.3g} agree with the Gaussians' to {agreement:.1%}")
     plan = MeshPlan(
         mode=mode,
         reference_frame=frame,

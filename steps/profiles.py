@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
 from dg4d_lib.asset_settings import AssetSettings, GateSettings, PackSettings, ScoreSettings
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from dg4d_lib.input_settings import (
     DrivingSettings,
     NoViewsSettings,
@@ -35,11 +35,11 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.weights.registry import lookup_weights
 from steps.catalog import STEPS
-from steps.contract import StepSpec, load_object, settings_errors, shown
+from steps.contract import StepSpec, load_object, settings_errors
 
 LARGEST_WHOLE = 2**53  # largest integer that every JSON reader represents exactly
 ZERO123_VARIANTS = {"zero123-xl": "xl", "stable-zero123": "stable"}  # by name in the registry
-CHANGED_KNOBS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
+RENAMED_SETTINGS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
     "text.steps": "text.num_inference_steps",
     "text.guidance": "text.guidance_scale",
     **{
@@ -133,7 +133,7 @@ class PipelineSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _refuse_old_names(cls, given: Any) -> Any:
-        for old, new in CHANGED_KNOBS.items():
+        for old, new in RENAMED_SETTINGS.items():
             branch = given
             for name in old.split("."):
                 branch = branch.get(name) if isinstance(branch, dict) else None
@@ -231,10 +231,10 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     """
     tree = settings.model_dump(mode="json")
     for key, value in changes.items():
-        if key in CHANGED_KNOBS and not isinstance(value, dict):
-            raise BadInput(_renamed(key, CHANGED_KNOBS[key]))
+        if key in RENAMED_SETTINGS and not isinstance(value, dict):
+            raise BadInput(_renamed(key, RENAMED_SETTINGS[key]))
         if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
-            raise BadInput(f"{key} = {shown(value)} is out of range; use at most {LARGEST_WHOLE}")
+            raise BadInput(f"{key} = {quoted(value)} is out of range; use at most {LARGEST_WHOLE}")
     for key, value in sorted(changes.items(), key=lambda change: not change[0].endswith(".kind")):
         *path, last = key.split(".")
         branch: Any = tree
@@ -385,6 +385,7 @@ OPEN = revise(
     },
 )
 
+ProfileName = Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"]
 PROFILES: dict[str, PipelineSettings] = {
     "preview": PREVIEW,
     "paper": PAPER,

@@ -4,14 +4,14 @@ Animations loop: the last frame is followed by the first. A position is a fracti
 the last frame to `frames` it interpolates back to the first frame.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.deformation.interface import Deformation, Displacement
+from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh
 
@@ -52,16 +52,31 @@ def pose_gaussians(
     """
     with torch.no_grad():
         times = positions.clamp(max=frames - 1) / max(1, frames - 1)
-        displacement = deformation.displace(gaussians.means, times.to(gaussians.means))
+        states = deformation.displace(gaussians.means, times.to(gaussians.means)).apply(gaussians)
         weight = (positions - (frames - 1)).clamp(min=0.0).to(gaussians.means)[:, None, None]  # of the first frame
         if (weight > 0).any():
-            start = deformation.displace(gaussians.means, gaussians.means.new_zeros(1))
-            displacement = Displacement(
-                torch.lerp(displacement.means, start.means, weight),
-                torch.lerp(displacement.log_scales, start.log_scales, weight),
-                torch.lerp(displacement.quats, start.quats, weight),
-            )
-        return displacement.apply(gaussians)
+            first = deformation.displace(gaussians.means, gaussians.means.new_zeros(1)).apply(gaussians)
+            states = _mixed(states, first, weight)
+        return states
+
+
+def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
+    """Interpolate Gaussians that are given per frame."""
+    before = positions.floor().long()
+    share = (positions - before).to(states.means)[:, None, None]
+    count = len(states.means)
+    return _mixed(states.states(before % count), states.states((before + 1) % count), share)
+
+
+def _mixed(states: Gaussians, others: Gaussians, share: Float[Tensor, "b 1 1"]) -> Gaussians:
+    """Return states between two, linearly; q and -q are one rotation, of which the nearer one counts."""
+    opposite = (states.quats * others.quats).sum(-1, keepdim=True) < 0
+    return replace(
+        states,
+        means=torch.lerp(states.means, others.means, share),
+        log_scales=torch.lerp(states.log_scales, others.log_scales, share),
+        quats=torch.lerp(states.quats, torch.where(opposite, -others.quats, others.quats), share),
+    )
 
 
 def interpolate_frames(values: Float[Tensor, "t n c"], positions: Float[Tensor, " m"]) -> Float[Tensor, "m n c"]:

@@ -16,11 +16,17 @@ FALLOFF = 2000.0  # per world unit squared: weights are exp(-FALLOFF d^2) (Luite
 def neighborhoods(
     means: Float[Tensor, "n 3"], count: int = NEIGHBORS
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Return the nearest neighbors of every Gaussian in the canonical cloud, and their weights."""
+    """Return the nearest neighbors of every Gaussian in the canonical cloud, and their weights.
+
+    None is its own neighbor; a single Gaussian has none.
+    """
     count = min(count, len(means) - 1)
     points = means.detach().cpu().numpy()
-    distances, indices = map(torch.as_tensor, cKDTree(points).query(points, k=count + 1))
-    return indices[:, 1:].long().to(means.device), torch.exp(-FALLOFF * distances[:, 1:].to(means).square())
+    distances, indices = map(torch.as_tensor, cKDTree(points).query(points, k=range(1, count + 2)))
+    others = indices != torch.arange(len(points))[:, None]
+    others[others.all(1), -1] = False  # of many at one place, it may not be among the nearest itself
+    distances, indices = (values[others].view(len(points), count) for values in (distances, indices))
+    return indices.long().to(means.device), torch.exp(-FALLOFF * distances.to(means).square())
 
 
 def rigidity_loss(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Float[Tensor, ""]:
@@ -32,7 +38,7 @@ def rigidity_loss(moved: Gaussians, indices: Int[Tensor, "n k"], weights: Float[
         weights: of the neighbors.
     """
     steps = len(moved.means) - 1
-    if steps < 1:
+    if steps < 1 or not indices.numel():
         return moved.means.new_zeros(())
     on_cpu = moved.means.device.type == "cpu" and moved.means.dtype == torch.float32
     total = (rigidity_sum if on_cpu else rigidity_sum_reference)(moved.means, moved.quats, indices, weights)

@@ -38,7 +38,7 @@ def rigidity_sum(
 
     Args:
         means: at two or more timestamps.
-        quats: rotations wxyz, of any non-zero norm.
+        quats: rotations wxyz, any norm from 1e-10 to 1e18.
         indices: neighbors of every Gaussian.
         weights: of the pairs.
     """

@@ -41,7 +41,7 @@ ENCODER_GB, DECODER_GB, UNET_GB = 0.8, 1.05, 0.15
 def karras_sigmas(steps: int) -> tuple[float, ...]:
     """Return `steps` noise levels from 700 to 0.002 whose 1/7th powers are evenly spaced, and a final 0."""
     top, bottom = SIGMA_MAX ** (1 / RHO), SIGMA_MIN ** (1 / RHO)
-    return (*((top + i / (steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
+    return (*((top + i / max(1, steps - 1) * (bottom - top)) ** RHO for i in range(steps)), 0.0)
 
 
 def start_index(steps: int, strength: float) -> int:

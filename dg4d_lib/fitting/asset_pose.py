@@ -26,6 +26,7 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 
 SIZE = 64  # pixels of the search
 FINE_SIZE = 96  # pixels of the refinement
+PICTURE_SIZE = 256  # pixels per side of the pictures for the user
 SEARCHED = 2500  # Gaussians in the search
 STEPS = 24  # azimuths of the search
 KEPT = 3  # candidates that are refined
@@ -182,11 +183,11 @@ def judge(
 
 
 def picture_of_both(
-    cloud: Gaussians, placement: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, size: int = 256
+    cloud: Gaussians, placement: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer
 ) -> Float[Tensor, "size width 3"]:
     """Draw subject, placed model and the outlines of both in a row, over white; red: subject alone, blue: model."""
-    target, mask = resize_cutouts(subject[None], size)
-    ((color, alpha),) = _renders(cloud, [placement], rasterize, size)
+    target, mask = resize_cutouts(subject[None], PICTURE_SIZE)
+    ((color, alpha),) = _renders(cloud, [placement], rasterize, PICTURE_SIZE)
     overlay = torch.cat([1 - alpha, 1 - torch.maximum(alpha, mask[0]), 1 - mask[0]], -1)
     return torch.cat([target[0], color, overlay], 1).clamp(0, 1)
 

@@ -202,7 +202,7 @@ class FlowTracker:
     @torch.no_grad()
     def _draw(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 3"]]:
         points = self._points(pose, np.arange(len(self._rest)))[0]
-        turned = functional.normalize(self._graph.blend(pose.quats()[None])[0], dim=-1)
+        turned = self._graph.blend_rotations(pose.quats()[None])[0]
         state = replace(
             self.cloud,
             means=torch.from_numpy(points).to(self.cloud.means),

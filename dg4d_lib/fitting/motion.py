@@ -36,7 +36,6 @@ def fit_motion(
     settings: MotionSettings,
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
-    input_camera: OrbitCamera | None = None,
     known: Mapping[int, Sequence[KnownView]] | None = None,
 ) -> Gaussians:
     """Fit `deformation` in place, and with `settings.fine_tune` the canonical Gaussians too.
@@ -44,13 +43,12 @@ def fit_motion(
     Args:
         gaussians: the canonical cloud, which is not modified; the fit runs on its device.
         deformation: the model to fit, on the same device; the identity at the start.
-        video: driving video of the input camera.
+        video: driving video, seen at azimuth and elevation 0.
         prior: scores random views of every frame.
         rasterize: rasterizer.
         settings: of the stage.
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
-        input_camera: camera of the video; the default is azimuth and elevation 0.
         known: further images by frame; an iteration compares one of them, drawn by their weights, with the weight of
             the video.
 
@@ -67,7 +65,7 @@ def fit_motion(
     def references(size: int) -> tuple[OrbitCamera, Tensor, Tensor]:
         """Return camera, color and alpha of the reference view; indexing keeps channels first in memory."""
         color, alpha = (images.permute(0, 3, 1, 2) for images in resize_cutouts(cutouts, size))
-        return replace(input_camera or OrbitCamera(), width=size, height=size), color, alpha
+        return OrbitCamera(width=size, height=size), color, alpha
 
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)

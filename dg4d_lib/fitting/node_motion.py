@@ -28,7 +28,7 @@ class NodeMotion:
     """Rigid transforms of the nodes at every frame, and of the whole model.
 
     Attributes:
-        quats: rotations of the nodes, wxyz, any non-zero norm.
+        quats: rotations of the nodes, wxyz, any norm from 1e-10 to 1e18.
         shifts: translations of the nodes.
         whole_quats: rotation of everything about the centroid of the nodes.
         whole_shifts: translation of everything.
@@ -64,8 +64,7 @@ class NodeMotion:
 
     def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
         """Return the blended rotations of the points, unit quaternions."""
-        unit = functional.normalize(self.quats, dim=-1)
-        blended = functional.normalize(graph.blend(unit), dim=-1)
+        blended = graph.blend_rotations(functional.normalize(self.quats, dim=-1))
         whole = functional.normalize(self.whole_quats, dim=-1)
         return quat_multiply(whole[:, None].expand_as(blended), blended)
 

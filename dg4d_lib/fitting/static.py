@@ -79,7 +79,6 @@ def fit_gaussians(
     settings: StaticSettings,
     generator: torch.Generator,
     report: Report = lambda iteration, values: None,
-    input_camera: OrbitCamera | None = None,
     known: Sequence[KnownView] = (),
     watch: Callable[[Gaussians], None] = lambda gaussians: None,
 ) -> Gaussians:
@@ -87,13 +86,12 @@ def fit_gaussians(
 
     Args:
         start: the cloud at iteration 0; the fit runs on its device.
-        subject: the cut-out, straight alpha.
+        subject: the cut-out, straight alpha, seen at azimuth and elevation 0.
         prior: scores random views.
         rasterize: rasterizer.
         settings: of the stage.
         generator: source of all randomness.
         report: called after every iteration with (iterations done, named losses).
-        input_camera: camera of the image; the default is azimuth and elevation 0.
         known: further images and their cameras; an iteration compares one of them, drawn by their weights, with the
             weight of the image.
         watch: called after every iteration with the cloud as it is then.
@@ -107,7 +105,7 @@ def fit_gaussians(
     @cache
     def references(size: int) -> list[tuple[OrbitCamera, Tensor, Tensor]]:
         """Return camera, color and alpha of the image and of the known views."""
-        views = [(input_camera or OrbitCamera(), subject), *((view.camera, view.cutout) for view in known)]
+        views = [(OrbitCamera(), subject), *((view.camera, view.cutout) for view in known)]
         return [
             (replace(camera, width=size, height=size), *resize_cutouts(cutout[None].to(device), size))
             for camera, cutout in views

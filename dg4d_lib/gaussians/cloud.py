@@ -22,7 +22,7 @@ class Gaussians:
     Attributes:
         means: world units.
         log_scales: natural logarithm of the standard deviations along the Gaussian's own axes.
-        quats: wxyz, any non-zero norm.
+        quats: wxyz, any norm from 1e-10 to 1e18.
         opacity_logits: logit of the opacity at the center.
         harmonics: spherical-harmonics coefficients of the color, degree 0 first.
     """

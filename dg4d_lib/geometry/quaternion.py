@@ -6,10 +6,10 @@ from torch import Tensor
 
 
 def quat_to_rotmat(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Convert quaternions of any non-zero norm to rotation matrices.
+    """Convert quaternions to rotation matrices.
 
     Args:
-        quats: wxyz, scalar first; normalized by this function.
+        quats: wxyz, scalar first, of norms from 1e-10 to 1e18 (in float32); normalized by this function.
 
     Returns:
         Proper rotations (determinant +1) that act on column vectors.

@@ -6,6 +6,7 @@ guess is left.
 """
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -30,23 +31,29 @@ class CarriedFields:
     def __init__(
         self,
         guess: Fields,
-        first: ShapeField,
+        first: ShapeField | None,
         cutouts: Sequence[Float[Tensor, "h w 4"]],
         most_strain: float = math.inf,
         normal: Float[np.ndarray, " 3"] | None = None,
     ) -> None:
-        """Follow the video.
+        """Store the fields; the video is followed as far as frames are asked for.
 
         Args:
             guess: fields of all frames.
-            first: field of the first frame.
+            first: known field of the first frame; None: its guess.
             cutouts: one per frame: square, straight alpha, color and alpha in [0, 1].
             most_strain: of the picture, at which the share of the first frame falls to 1/e. Parts that turn in depth
                 are foreshortened; a first frame that is a guess too says no more of them than the own guess.
             normal: horizontal unit vector across the plane in which parts move; None: that of the image.
+
+        Raises:
+            BadInput: the first frame is a guess and shows no subject.
         """
-        self._guess, self._first, self._most_strain, self._normal = guess, first, most_strain, normal
-        self._matches = match_first_frame([premultiplied(cutout) for cutout in cutouts])
+        self._guess, self._most_strain, self._normal = guess, most_strain, normal
+        self._first, self._first_is_guess = (guess.predict(0), True) if first is None else (first, False)
+        self._upcoming = match_first_frame([premultiplied(cutout) for cutout in cutouts])
+        self._matches: list[Correspondence] = []
+        self._matching = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._guess)
@@ -57,7 +64,8 @@ class CarriedFields:
         Raises:
             BadInput: the frame shows no subject.
         """
-        own, match = self._guess.predict(frame), self._matches[frame]
+        own = self._first if self._first_is_guess and frame == 0 else self._guess.predict(frame)
+        match = self._match(frame)
         carried, share = carry(self._first, match, self._normal), match.trust
         if math.isfinite(self._most_strain):
             share = share * torch.exp(-(strain(match, own.mask) / self._most_strain).square())
@@ -65,6 +73,13 @@ class CarriedFields:
         hidden = own.hidden + share[..., None, None] * (carried.hidden - own.hidden)
         logits = bounded_logits(logits, own.mask)
         return replace(own, logits=logits, hidden=hidden, generosity=self._first.generosity)
+
+    def _match(self, frame: int) -> Correspondence:
+        """Return the correspondence of a frame; threads that ask for several frames follow the video once."""
+        with self._matching:
+            while len(self._matches) <= frame:
+                self._matches.append(next(self._upcoming))
+        return self._matches[frame]
 
 
 def carry(field: ShapeField, match: Correspondence, normal: Float[np.ndarray, " 3"] | None = None) -> ShapeField:

@@ -99,4 +99,5 @@ def _blur_and_shift(
 
 
 def _pose(camera: OrbitCamera) -> tuple[float, float, float]:
-    return (round(camera.elevation_deg, 3), round(camera.azimuth_deg % 360, 3), round(camera.radius, 3))
+    azimuth_deg = round(camera.azimuth_deg % 360, 3) % 360  # just below 0 is 0, not 360
+    return (round(camera.elevation_deg, 3), azimuth_deg, round(camera.radius, 3))

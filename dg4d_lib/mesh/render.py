@@ -1,10 +1,11 @@
 """Renders of a textured mesh, unlit and lit."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
@@ -13,12 +14,60 @@ from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
-from dg4d_lib.mesh_rasterizer.texture_cpu import Rasterized, texture_colors
+from dg4d_lib.mesh_rasterizer.texture_cpu import MipLevels, Rasterized, mip_levels, texture_colors
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
 SUPERSAMPLING = 3  # samples per pixel along each axis, unless told; odd, so that no pixel is covered by exactly half
 LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera's axes (x right, y down, z forward)
 AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its color
+
+
+class VertexGroups(NamedTuple):
+    """Vertices at equal positions, which texture seams split.
+
+    Attributes:
+        first: one vertex of every group.
+        group: group of every vertex.
+    """
+
+    first: Int[Tensor, " w"]
+    group: Int[Tensor, " v"]
+
+
+class LitRenderer:
+    """Renders under one distant light and ambient light, with smooth normals; folds and dents show.
+
+    The seams and mip levels of the last mesh are kept, for later states of it: meshes that share the tensor `faces` or
+    `texture`.
+    """
+
+    def __init__(self, supersampling: int = SUPERSAMPLING) -> None:
+        """Store the number of samples per pixel along each axis."""
+        self._supersampling = supersampling
+        self._groups: tuple[Tensor, VertexGroups] | None = None  # with the faces
+        self._mips: tuple[Tensor, MipLevels] | None = None  # with the texture
+
+    def render(self, mesh: TexturedMesh, camera: OrbitCamera) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
+        """Return straight color and alpha, in [0, 1]."""
+        towards = normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0) @ camera.viewmat()[:3, :3]
+        normals = smooth_normals(mesh, self._groups_of(mesh))
+        light = AMBIENT + DIFFUSE * (normals @ towards.to(mesh.vertices)).clamp_min(0)
+        color, alpha = _render(mesh, mesh.vertices, [camera], light, self._supersampling, self._mips_of)
+        return color[0], alpha[0]
+
+    def _groups_of(self, mesh: TexturedMesh) -> VertexGroups:
+        if self._groups is not None and self._groups[0] is mesh.faces:
+            groups = self._groups[1]
+            if torch.equal(mesh.vertices[groups.first][groups.group], mesh.vertices):  # no seam has opened
+                return groups
+        groups = vertex_groups(mesh)
+        self._groups = mesh.faces, groups
+        return groups
+
+    def _mips_of(self, texture: Float[Tensor, "y x 3"]) -> MipLevels:
+        if self._mips is None or self._mips[0] is not texture:
+            self._mips = texture, mip_levels(texture)
+        return self._mips[1]
 
 
 def render_mesh(
@@ -49,7 +98,7 @@ def render_mesh(
 def render_lit(
     mesh: TexturedMesh, camera: OrbitCamera, supersampling: int = SUPERSAMPLING
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
-    """Render a mesh under one distant light and ambient light, with smooth normals; folds and dents show.
+    """Render a mesh once as `LitRenderer` does.
 
     Args:
         mesh: the mesh.
@@ -59,10 +108,7 @@ def render_lit(
     Returns:
         Straight color and alpha, in [0, 1].
     """
-    towards = normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0) @ camera.viewmat()[:3, :3]
-    light = AMBIENT + DIFFUSE * (smooth_normals(mesh) @ towards.to(mesh.vertices)).clamp_min(0)
-    color, alpha = _render(mesh, mesh.vertices, [camera], light, supersampling)
-    return color[0], alpha[0]
+    return LitRenderer(supersampling).render(mesh, camera)
 
 
 def _render(
@@ -71,13 +117,15 @@ def _render(
     cameras: Sequence[OrbitCamera],
     light: Float[Tensor, " v"] | None,
     side: int,
+    mips_of: Callable[[Tensor], MipLevels] = mip_levels,
 ) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
     """Return straight color and alpha of pixels of several samples a side, under a light if vertices have one."""
     fine = [replace(camera, width=side * camera.width, height=side * camera.height) for camera in cameras]
     fragments = rasterize_mesh(vertices, mesh.faces, fine)
     with_gradients = torch.is_grad_enabled() and mesh.texture.requires_grad
     if vertices.device.type == "cpu" and mesh.texture.dtype == torch.float32 and not with_gradients:
-        return texture_colors(Rasterized(vertices, mesh.faces, mesh.uvs, fine, fragments), mesh.texture, light, side)
+        rasterized = Rasterized(vertices, mesh.faces, mesh.uvs, fine, fragments)
+        return texture_colors(rasterized, mips_of(mesh.texture), light, side)
     lookup = build_lookup(vertices, mesh.faces, mesh.uvs, mesh.texture.shape[:2], fine, fragments)
     samples = mesh.texture.new_zeros((*lookup.covered.shape, 3))
     samples[lookup.covered] = sample_texture(mesh.texture, lookup)
@@ -88,7 +136,17 @@ def _render(
     return color / alpha.clamp_min(0.5 / side**2), alpha
 
 
-def smooth_normals(mesh: TexturedMesh) -> Float[Tensor, "v 3"]:
-    """Return area-weighted unit normals, equal on both sides of texture seams."""
-    first, position = map(torch.from_numpy, group_vertices(mesh.vertices.numpy()))
-    return vertex_normals(mesh.vertices[first], position[mesh.faces.long()])[position]
+def smooth_normals(mesh: TexturedMesh, groups: VertexGroups | None = None) -> Float[Tensor, "v 3"]:
+    """Return area-weighted unit normals, equal on both sides of texture seams.
+
+    Args:
+        mesh: the mesh.
+        groups: its `vertex_groups`; None: they are found.
+    """
+    first, group = groups or vertex_groups(mesh)
+    return vertex_normals(mesh.vertices[first], group[mesh.faces.long()])[group]
+
+
+def vertex_groups(mesh: TexturedMesh) -> VertexGroups:
+    """Return which vertices of a mesh have equal positions."""
+    return VertexGroups(*map(torch.from_numpy, group_vertices(mesh.vertices.numpy())))

@@ -39,6 +39,18 @@ class Rasterized(NamedTuple):
     fragments: Fragments
 
 
+class MipLevels(NamedTuple):
+    """Texture and all its halvings.
+
+    Attributes:
+        texels: colors of all levels, row by row, the finest first.
+        shapes: first texel, height and width of each level.
+    """
+
+    texels: Float32[np.ndarray, "n 3"]
+    shapes: Int[np.ndarray, "l 3"]
+
+
 def texture_places(rasterized: Rasterized, size: Sequence[int]) -> tuple[Float32[Tensor, "p 2"], Float32[Tensor, " p"]]:
     """Return texture coordinates and mip levels of all covered pixels, for a texture of that height and width."""
     starts = np.concatenate([[0], (rasterized.fragments.faces >= 0).sum((1, 2)).numpy().cumsum()])
@@ -53,13 +65,13 @@ def texture_places(rasterized: Rasterized, size: Sequence[int]) -> tuple[Float32
 
 
 def texture_colors(
-    rasterized: Rasterized, texture: Float[Tensor, "y x 3"], light: Float[Tensor, " v"] | None, side: int
+    rasterized: Rasterized, mips: MipLevels, light: Float[Tensor, " v"] | None, side: int
 ) -> tuple[Float32[Tensor, "b h w 3"], Float32[Tensor, "b h w 1"]]:
     """Return straight color and alpha of pixels, each the mean of `side` x `side` samples.
 
     Args:
         rasterized: the mesh in images whose pixels are the samples.
-        texture: colors in [0, 1].
+        mips: of the texture, colors in [0, 1].
         light: factor of the colors at every vertex; lit colors end at 1. None: 1.
         side: samples per pixel along each axis.
     """
@@ -67,12 +79,11 @@ def texture_colors(
     color = np.zeros((count, height // side, width // side, 3), np.float32)
     alpha = np.zeros((*color.shape[:3], 1), np.float32)
     factors = None if light is None else light.detach().float().numpy()
-    mips = _mip_levels(texture.detach().float().numpy())
 
     def shade(view: int, *scene: object) -> None:
         _shade(*scene, *mips, factors, side, color[view], alpha[view])
 
-    _of_views(shade, rasterized, texture.shape[:2])
+    _of_views(shade, rasterized, mips.shapes[0, 1:].tolist())
     return torch.from_numpy(color), torch.from_numpy(alpha)
 
 
@@ -92,11 +103,9 @@ def _of_views(work: Callable[..., None], rasterized: Rasterized, size: Sequence[
     run_parallel([partial(of_view, view) for view in range(len(cameras))])
 
 
-def _mip_levels(
-    texture: Float32[np.ndarray, "y x 3"],
-) -> tuple[Float32[np.ndarray, "n 3"], Int[np.ndarray, "l 3"]]:
-    """Return the texels of the texture and all its halvings, and first texel, height and width of each."""
-    levels = [texture]
+def mip_levels(texture: Float[Tensor, "y x 3"]) -> MipLevels:
+    """Return a texture and all its halvings, down to a single texel."""
+    levels = [texture.detach().float().numpy()]
     while max(levels[-1].shape[:2]) > 1:
         height, width = levels[-1].shape[:2]
         if height % 2 == width % 2 == 0:
@@ -108,7 +117,8 @@ def _mip_levels(
         levels.append(half)
     sizes = np.array([level.shape[:2] for level in levels])
     firsts = np.concatenate([[0], sizes.prod(1).cumsum()[:-1]])
-    return np.concatenate([level.reshape(-1, 3) for level in levels]), np.concatenate([firsts[:, None], sizes], 1)
+    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    return MipLevels(texels, np.concatenate([firsts[:, None], sizes], 1))
 
 
 @njit(**_COMPILED)

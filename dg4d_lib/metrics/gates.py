@@ -189,8 +189,9 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             settings.flaws_most,
             "",
-            "boundary and non-manifold edges, degenerate and inverted triangles: per triangle; not a given model's own",
-            "extract again with another mesh.density_threshold or a larger mesh.grid",
+            "share of defects per triangle: open or non-manifold edges, degenerate or inverted triangles; defects that "
+            "your own model already has do not count",
+            "use mesh.source=gaussians with another mesh.density_threshold or a larger mesh.grid",
         ),
         Gate(
             "folds",
@@ -198,8 +199,8 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             settings.added_folds_most if inputs.own_model else settings.folds_most,
             "",
-            "share of the triangles that cross others, are flipped or folded, in the worst frame: light shows them; "
-            "what a given model has at rest does not count",
+            "share of triangles that cross others, are flipped or folded, in the worst frame; visible as dark creases "
+            "under light; those that your own model has at rest do not count",
             "use mesh.mode=per_frame for complex motions, or a smaller mesh.grid",
         ),
         Gate(
@@ -209,7 +210,8 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             "",
             "overlap of the silhouettes of mesh and splats, over sides and frames",
-            "lower mesh.density_threshold for thin parts, or use mesh.mode=per_frame for complex motions",
+            "use mesh.source=gaussians with a lower mesh.density_threshold for thin parts, or mesh.mode=per_frame for "
+            "complex motions",
         ),
         Gate(
             "sharpness",

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.kernels.workers import run_parallel
+from dg4d_lib.metrics.image import as_float
 
 WINDOW, SIGMA = 11, 1.5  # pixels, Gaussian window (Wang et al. 2004)
 C1, C2 = 0.01**2, 0.03**2  # stabilizers of luminance and contrast for images in [0, 1] (Wang et al. 2004)
@@ -24,17 +25,18 @@ def ssim(images: Float[Tensor, "b h w c"], ground_truth: Float[Tensor, "b h w c"
     """Return the structural similarity of images in [0, 1] (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5.
 
     Population covariances; mean over channels and all positions of the window inside the image. 1 is equal. Computed on
-    the CPU in the precision of the images (float32: accurate to 2e-6); differentiable once, in the images.
+    the CPU in the precision of the images, at least float32 (accurate to 2e-6); differentiable once, in the images.
 
     Raises:
-        BadInput: images with fewer than 11 pixels on a side.
+        BadInput: images with fewer than 11 pixels on a side, or of integers.
         ValueError: the ground truth requires a gradient.
     """
     if min(images.shape[1:3]) < WINDOW:
         raise BadInput(f"SSIM needs images of at least {WINDOW} x {WINDOW} pixels; given {tuple(images.shape[1:3])}")
     if ground_truth.requires_grad:
         raise ValueError("SSIM has no gradient in the ground truth; detach it")
-    pair = (images, ground_truth.to(images.dtype))
+    images = as_float(images)
+    pair = (images, as_float(ground_truth).to(images.dtype))
     similarity: Tensor = _Ssim.apply(*(planes.movedim(-1, 1).cpu() for planes in pair))
     return similarity.to(images)
 

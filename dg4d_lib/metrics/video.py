@@ -1,8 +1,13 @@
-"""Temporal metrics of two videos of one view; frames in [0, 1], over the same background."""
+"""Temporal metrics of two videos of one view; frames in [0, 1], over the same background.
+
+Frames of integers raise BadInput.
+"""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from dg4d_lib.metrics.image import as_float
 
 BLUR_SHARE = 1 / 32  # of the frame height: tolerance for misplaced changes (ours)
 EPS = 1e-9  # avoids division by zero for a still ground truth
@@ -20,8 +25,8 @@ def flicker(
         ground_truth: reference frames.
         region: 1 where either video shows the subject; a change counts if the subject is there before or after it.
     """
-    counted = torch.maximum(region[1:], region[:-1])
-    difference = (frames.diff(dim=0) - ground_truth.diff(dim=0)).abs().mean(-1, keepdim=True)
+    difference = (_changes(frames) - _changes(ground_truth)).abs().mean(-1, keepdim=True)
+    counted = torch.maximum(region[1:], region[:-1]).to(difference)
     return 255 * (difference * counted).sum() / counted.sum().clamp_min(1)
 
 
@@ -32,13 +37,17 @@ def temporal_error(frames: Float[Tensor, "t h w c"], ground_truth: Float[Tensor,
     the result is the L1 norm of their difference, relative to the ground truth's changes. 0 is the true motion, 1 a
     still video, more is worse than still. For a still ground truth the slightest change gives a huge value.
     """
-    ours, theirs = (_blurred(video.diff(dim=0).abs().mean(-1)) for video in (frames, ground_truth))
+    ours, theirs = (_blurred(_changes(video).abs().mean(-1)) for video in (frames, ground_truth))
     return (ours - theirs).abs().sum() / theirs.sum().clamp_min(EPS)
 
 
 def motion_amount(frames: Float[Tensor, "t h w c"], ground_truth: Float[Tensor, "t h w c"]) -> Float[Tensor, ""]:
     """Return the total change relative to the ground truth's: 1 is equal, 0 a still video."""
-    return frames.diff(dim=0).abs().sum() / ground_truth.diff(dim=0).abs().sum().clamp_min(EPS)
+    return _changes(frames).abs().sum() / _changes(ground_truth).abs().sum().clamp_min(EPS)
+
+
+def _changes(frames: Float[Tensor, "t h w c"]) -> Float[Tensor, "t-1 h w c"]:
+    return as_float(frames).diff(dim=0)
 
 
 def _blurred(planes: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:

@@ -52,12 +52,15 @@ def rasterize(
     per_camera = has_state_per_camera(gaussians, cameras)
     require_finite(gaussians)
     background = background.to(gaussians.means)
+    if means2d_offsets is None:
+        means2d_offsets = gaussians.means.new_zeros(len(cameras), len(gaussians), 2)
     views = []
     for view, camera in enumerate(cameras):
-        splats = _project(gaussians.at(view) if per_camera else gaussians, camera)
-        if means2d_offsets is not None:
-            splats.means2d = splats.means2d + means2d_offsets[view].to(splats.means2d)
-        views.append(_render(splats, background, height, width))
+        state = gaussians.at(view) if per_camera else gaussians
+        offsets = means2d_offsets[view].to(state.means)
+        visible, drawn = _sorted_by_depth(_project(state, camera, offsets), height, width)
+        splats = _project(state.subset(drawn), camera, offsets[drawn])  # gradients of others could be 0 times infinity
+        views.append((*_render(splats, background, height, width), visible))
     color, alpha, depth, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
     return Rendering(color, alpha, depth, visible)
 
@@ -72,11 +75,8 @@ class _Splats:
     opacities: Float[Tensor, " n"]
     colors: Float[Tensor, "n 3"]
 
-    def __getitem__(self, index: Int[Tensor, " m"]) -> "_Splats":
-        return _Splats(*(value[index] for value in vars(self).values()))
 
-
-def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
+def _project(gaussians: Gaussians, camera: OrbitCamera, means2d_offsets: Float[Tensor, "n 2"]) -> _Splats:
     viewmat = camera.viewmat().to(gaussians.means)
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)
@@ -90,24 +90,29 @@ def _project(gaussians: Gaussians, camera: OrbitCamera) -> _Splats:
     ).unflatten(-1, (2, 3))  # fmt: skip
     half = jacobian @ rotation @ (quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None, :])
     covars2d = half @ half.mT + BLUR * torch.eye(2).to(half)
-    return _Splats(means2d, covars2d, z, gaussians.opacities, gaussians.colors)
+    return _Splats(means2d + means2d_offsets, covars2d, z, gaussians.opacities, gaussians.colors)
+
+
+@torch.no_grad()
+def _sorted_by_depth(splats: _Splats, height: int, width: int) -> tuple[Bool[Tensor, " n"], Int[Tensor, " m"]]:
+    """Return which Gaussians are visible, and the indices of these, the nearest first."""
+    visible = _visible(splats, height, width)
+    order = torch.argsort(splats.depths, stable=True)
+    return visible, order[visible[order]]
 
 
 def _render(
     splats: _Splats, background: Float[Tensor, " 3"], height: int, width: int
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"], Float[Tensor, "h w 1"], Bool[Tensor, " n"]]:
-    visible = _visible(splats, height, width)
-    order = torch.argsort(splats.depths.detach(), stable=True)
-    drawn = splats[order[visible[order]]]
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"], Float[Tensor, "h w 1"]]:
+    """Return color, alpha and depth; the Gaussians are sorted by depth."""
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(-1, 2).to(background)
-    chunk = max(1, _PAIRS_PER_CHUNK // max(1, drawn.depths.numel()))
-    parts = [checkpoint(_blend, part, drawn, background, use_reentrant=False) for part in pixels.split(chunk)]
+    chunk = max(1, _PAIRS_PER_CHUNK // max(1, splats.depths.numel()))
+    parts = [checkpoint(_blend, part, splats, background, use_reentrant=False) for part in pixels.split(chunk)]
     color, alpha, depth = torch.cat(parts).reshape(height, width, 5).split((3, 1, 1), -1)
-    return color, alpha, depth, visible
+    return color, alpha, depth
 
 
-@torch.no_grad()
 def _visible(splats: _Splats, height: int, width: int) -> Bool[Tensor, " n"]:
     """Return true for Gaussians beyond the near plane, opaque enough, and with a pixel center in their bounds."""
     opaque = splats.opacities > MIN_ALPHA

@@ -4,7 +4,7 @@ Every frame is compared with the first one, warped as the frame before was found
 and motions between distant frames need no large flow.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,8 +78,8 @@ def strain(match: Correspondence, mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h
     return torch.from_numpy(np.abs(np.log(stretch)).max(-1)).float()
 
 
-def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> list[Correspondence]:
-    """Return the correspondence of every frame, the first one included.
+def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> Iterator[Correspondence]:
+    """Yield the correspondence of every frame, the first one included, each computed when it is asked for.
 
     Args:
         pictures: premultiplied color and alpha of the frames, in [0, 1].
@@ -87,15 +87,16 @@ def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> list[Corres
     first = pictures[0]
     rows, columns = (torch.arange(size, dtype=torch.float32) for size in first.shape[1:])
     pixels = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1)
-    matches = [Correspondence(pixels, torch.ones(first.shape[1:]))]
+    match = Correspondence(pixels, torch.ones(first.shape[1:]))
+    yield match
     for picture in pictures[1:]:
-        expected = matches[-1].warp(first)
+        expected = match.warp(first)
         flow = optical_flow_tvl1(_gray(picture), _gray(expected), num_warp=WARPS, num_iter=STEPS)
-        step = Correspondence(pixels + torch.from_numpy(np.stack(flow, -1)).float(), matches[-1].trust)
-        places = step.warp(matches[-1].places.permute(2, 0, 1)).permute(1, 2, 0)
-        moved = Correspondence(places, matches[-1].trust)
-        matches.append(Correspondence(places, _agreement(picture, moved.warp(first))))
-    return matches
+        step = Correspondence(pixels + torch.from_numpy(np.stack(flow, -1)).float(), match.trust)
+        places = step.warp(match.places.permute(2, 0, 1)).permute(1, 2, 0)
+        moved = Correspondence(places, match.trust)
+        match = Correspondence(places, _agreement(picture, moved.warp(first)))
+        yield match
 
 
 def _gray(picture: Float[Tensor, "4 h w"]) -> Float[np.ndarray, "h w"]:

@@ -27,19 +27,15 @@ class StableVideo:
         if settings.frames != model.num_frames:
             self.notes = (f"The video model was trained on {model.num_frames} frames and made {settings.frames}.",)
 
-    def generate(self, subject: Float[Tensor, "h w 4"], generator: torch.Generator) -> DrivingVideo:
-        """Generate one video.
-
-        Args:
-            subject: straight alpha, in [0, 1].
-            generator: random numbers for the noise, on the CPU so that all devices agree; determines the motion.
-        """
-        return self.generate_all(subject, [generator])[0]
-
     def generate_all(
         self, subject: Float[Tensor, "h w 4"], generators: Sequence[torch.Generator]
     ) -> list[DrivingVideo]:
-        """Generate a video per random generator in one batch; equal to `generate` up to rounding."""
+        """Generate a video per random generator in one batch; each as if generated alone, up to rounding.
+
+        Args:
+            subject: straight alpha, in [0, 1].
+            generators: random numbers for the noise, on the CPU so that all devices agree; determine the motions.
+        """
         canvas, (rows, columns) = white_canvas(subject, self.settings.height, self.settings.width)
         return [self._cut_out(frames[:, rows, columns], subject) for frames in self._sample(canvas, generators)]
 

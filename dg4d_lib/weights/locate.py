@@ -122,15 +122,14 @@ def find_problems(
     return wrong | dict.fromkeys(sorted(other), "differs from the pulled file (sha256)")
 
 
-def find_unpublished(folder: Path, weights: Weights, cache: Path | None = None) -> dict[str, str]:
+def find_unpublished(folder: Path, weights: Weights) -> dict[str, str]:
     """Return the problem of every file that differs from its published digest; unknown and missing files pass.
 
     Args:
         folder: of the weights.
         weights: their entry of the registry.
-        cache: as in `digests`.
     """
-    have = _digests_of([path for name in weights.published if (path := folder / name).is_file()], cache)
+    have = _digests_of([path for name in weights.published if (path := folder / name).is_file()], None)
     found = {path.relative_to(folder).as_posix(): digest for path, digest in have.items()}
     where = f" at revision {weights.revision[:10]}" if weights.revision else ""
     other = [name for name, digest in found.items() if digest != weights.published[name]]

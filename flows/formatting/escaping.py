@@ -8,7 +8,6 @@ _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u
 # markup that works anywhere; emphasis outside of words; addresses that become links; lists, rules and headings
 _MARKUP = re.compile(r"[\\`*\[\]<>#|~@&]|(?<!\w)_|_(?!\w)|(?<=www)\.|:(?=//)|^[-+=]", re.IGNORECASE)
 _NUMBERED = re.compile(r"^(\d+)([.)])")
-SHOWN = 80  # characters of a value in a message
 # first characters of a formula, by OWASP's "CSV Injection"; the last four are the fullwidth forms of the first
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
@@ -30,9 +29,3 @@ def markdown(text: object) -> str:
 def csv_cell(value: Any) -> Any:
     """Put an apostrophe before text that a spreadsheet would run as a formula; numbers stay numbers."""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
-
-
-def quoted(value: object) -> str:
-    """Quote a value for a message, shortened to `SHOWN` characters."""
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."

@@ -103,7 +103,7 @@ class ViewsRequest(Frozen):
             paths = [path for path, _ in self._cameras(source)[1]] if self.cameras else [v.path for v in self.views]
             files |= {view.file: path for view, path in zip(given.views, paths, strict=True)}
             if self.turntable is not None:
-                files[given.turntable] = _one_file(self.turntable, Path(scratch), store)
+                files[given.turntable] = _one_file(self.turntable, store)
             about.write_text(given.model_dump_json(), encoding="utf-8")
             return sources.put_zip(files, VIEWS.media_type, store)
 
@@ -182,7 +182,7 @@ def _existing(path: Path) -> Path:
     return path if path.suffix or path.exists() else path.with_suffix(".png")
 
 
-def _one_file(path: Path, scratch: Path, store: ArtifactStore) -> Path:
+def _one_file(path: Path, store: ArtifactStore) -> Path:
     """Return a video, or a folder of frames as one zip."""
     if not path.is_dir():
         return path

@@ -4,7 +4,7 @@ import json
 import math
 from typing import Any
 
-from flows.formatting.escaping import quoted
+from dg4d_lib.errors import quoted
 
 DEEPEST = 100  # nested brackets; a provenance record has about ten
 MOST_DIGITS = 100  # of an integer; Python itself refuses more than 4300

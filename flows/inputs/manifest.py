@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.errors import BadInput, DG4DError, quoted
 from dg4d_lib.input_settings import BOX_FORM
-from flows.formatting.escaping import quoted, visible
+from flows.formatting.escaping import visible
 from flows.inputs import listing, sources
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
 from flows.inputs.given_views import ViewsRequest, views_in_cell
 from flows.inputs.json_text import UnfitJSON, loads
 from flows.inputs.naming import check_path, clean_name, unique_names
 from flows.inputs.rows import MANIFESTS, ManifestRow, read_rows
-from flows.inputs.setting_reference import check_names
+from flows.inputs.setting_reference import check_changes
 from steps.contract import LARGEST_SEED, Frozen
 from steps.profiles import PipelineSettings, profile, revise
 
@@ -159,7 +159,7 @@ def parse_changes(pairs: list[str]) -> dict[str, Any]:
         if not equals or not key:
             raise BadInput(f"a setting is NAME=VALUE, for example motion.iterations=200; given {quoted(pair)}")
         changes[key] = _value(key, value)
-    check_names(changes)
+    check_changes(changes)
     return dict(sorted(changes.items(), key=lambda pair: not pair[0].endswith(".kind")))  # a kind resets the others
 
 
@@ -298,7 +298,7 @@ def _settings_in(cells: Mapping[str, Any]) -> dict[str, Any]:
     columns = {
         name: _value(name, value) if isinstance(value, str) else value for name, value in cells.items() if "." in name
     }
-    check_names({**own, **columns})
+    check_changes({**own, **columns})
     return {**own, **columns}
 
 

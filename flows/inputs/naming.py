@@ -5,8 +5,8 @@ import unicodedata
 from collections import Counter
 from pathlib import Path, PurePath, PurePosixPath
 
-from dg4d_lib.errors import BadInput
-from flows.formatting.escaping import quoted, visible
+from dg4d_lib.errors import BadInput, quoted
+from flows.formatting.escaping import visible
 
 LONGEST_PART_BYTES = 230  # of one folder: file systems take 255, of which names of scratch folders need up to 25
 LONGEST_NAME_BYTES = 1000  # of a name with its folders

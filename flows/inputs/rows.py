@@ -10,8 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dg4d_lib.errors import BackendUnavailable, BadInput
-from flows.formatting.escaping import quoted
+from dg4d_lib.errors import BackendUnavailable, BadInput, quoted
 from flows.inputs.json_text import loads
 
 COLUMNS = (

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from dg4d_lib.asset_settings import ScoreSettings
-from dg4d_lib.errors import BadInput
-from flows.formatting.escaping import quoted
-from steps.profiles import CHANGED_KNOBS, PipelineSettings
+from dg4d_lib.errors import BadInput, quoted
+from steps.profiles import RENAMED_SETTINGS, PipelineSettings
 
 TYPES = {"integer": "integer", "number": "number", "boolean": "true or false", "string": "text"}
 BOUNDS = {
@@ -83,8 +82,27 @@ def check_names(names: Iterable[str]) -> None:
     known = {one.name for one in all_settings()}
     sections = {name.rpartition(".")[0] for name in known} | {name.split(".")[0] for name in known}
     for name in names:
-        if name not in known and name not in sections and name not in CHANGED_KNOBS:
+        if name not in known and name not in sections and name not in RENAMED_SETTINGS:
             raise BadInput(f"unknown setting {quoted(name)}; {_advice(name, sorted(known))}")
+
+
+def check_changes(changes: Mapping[str, Any]) -> None:
+    """Refuse unknown names, and groups of settings that get a single value.
+
+    Raises:
+        BadInput: suggests the nearest name, or a setting of the group.
+    """
+    check_names(changes)
+    names = {one.name for one in all_settings()}
+    for name, value in changes.items():
+        members = [one for one in all_settings() if one.name.startswith(f"{name}.")]
+        if name in names or not members or isinstance(value, dict):
+            continue
+        takers = [one.name for one in (*members, *all_settings()) if value in one.allowed.split(", ")]
+        example = f"{takers[0]}={value}" if takers else f"{members[-1].name}={members[-1].default}"
+        raise BadInput(
+            f"{name} is a group of settings; name one, for example {example}; `dg4d settings {name}` lists them"
+        )
 
 
 def as_json(value: Any) -> str:
@@ -93,10 +111,9 @@ def as_json(value: Any) -> str:
 
 
 def _advice(name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    if not near:  # the section may be wrong or missing, and the last part right
-        last = name.rpartition(".")[2]
-        near = [one for one in known if one.rpartition(".")[2] == last][:1]
+    last = name.rpartition(".")[2]
+    same = [one for one in known if one.rpartition(".")[2] == last]  # the section may be wrong or missing
+    near = difflib.get_close_matches(name, same or known, n=1, cutoff=0.0 if same else 0.6)
     section = name.partition(".")[0]
     listing = f"`dg4d settings {section}`" if section in SECTIONS else "`dg4d settings`"
     return f"did you mean {near[0]}? {listing} lists the names" if near else f"{listing} lists the names"

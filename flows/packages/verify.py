@@ -56,7 +56,7 @@ class Verification(Frozen):
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
         """Yield name, state and detail of everything that is not whole, and one row per kind for all that is."""
-        for kind, one in (("file", "file"), ("record", "step record")):
+        for kind, one in (("file", "file"), ("record", "step record"), ("signature", "signature")):
             checks = [check for check in self.checks if check.kind == kind]
             if count := sum(check.state == "whole" for check in checks):
                 yield f"{count} {one}{'s' * (count != 1)}", "unchanged", ""

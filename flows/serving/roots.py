@@ -116,13 +116,13 @@ class Roots(Frozen):
         self.check_files(file for file in (*files, *asked.given_views.files()) if file is not None)
         self.check_weights(item.request.settings.model_dump(mode="json"))
 
-    def check_knobs(self, knobs: Mapping[str, Any]) -> None:
+    def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Refuse settings such as `prior.weights` that name folders of weights which may not be read.
 
         Raises:
             BadInput: a folder is outside.
         """
-        for name, value in knobs.items():
+        for name, value in settings.items():
             self.check_weights({name.rpartition(".")[2]: value})
 
     def check_weights(self, tree: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from flows.studio import gallery, quick
 from flows.studio.drafts import MOST_MASK_BYTES, Draft, TooLarge
 from flows.studio.pages import HEADERS
 from flows.studio.server_api import ENDED, ServerApi
-from flows.studio.submission import Order, Submission, again, order, retry
+from flows.studio.submission import RunRequest, Submission, again, convert, retry
 from steps.contract import LARGEST_SEED, Frozen
 
 T = TypeVar("T", bound=BaseModel)
@@ -103,7 +103,7 @@ class Changes:
     async def convert(self, request: Request) -> Response:
         """Start the conversion of a draft."""
         draft, wanted = Draft(request.path_params["identifier"]), await _parsed(request, Submission)
-        return await self._start(await run_in_threadpool(lambda: order(draft, wanted)))
+        return await self._start(await run_in_threadpool(lambda: convert(draft, wanted)))
 
     async def cancel(self, request: Request) -> Response:
         """Ask for the end of a conversion."""
@@ -133,7 +133,7 @@ class Changes:
             )
         return await self._start(again(run, wanted.settings, wanted.seed))
 
-    async def _start(self, wanted: Order) -> Response:
+    async def _start(self, wanted: RunRequest) -> Response:
         identifier = await self._api.start(*wanted)
         return _json({"id": identifier, "address": f"{STUDIO_ADDRESS}/runs/{identifier}"}, 201)
 

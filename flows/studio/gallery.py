@@ -157,10 +157,10 @@ def find(store: ArtifactStore, key: str) -> Asset:
     return found
 
 
-def chosen(found: Sequence[Asset], wanted: Filter, now: datetime | None = None) -> list[Asset]:
+def chosen(found: Sequence[Asset], wanted: Filter) -> list[Asset]:
     """Return the assets that a filter takes."""
-    moment = now or datetime.now(UTC)
-    return [asset for asset in found if wanted.takes(asset, moment)]
+    now = datetime.now(UTC)
+    return [asset for asset in found if wanted.takes(asset, now)]
 
 
 def page_of(found: Sequence[Asset], number: int) -> Sequence[Asset]:

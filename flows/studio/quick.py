@@ -5,7 +5,6 @@ of conversions are, so an equal step of a conversion takes them.
 """
 
 import functools
-import json
 import threading
 from pathlib import Path
 from typing import Any
@@ -86,7 +85,7 @@ def cut_out(draft: Draft, upload: Upload, box: tuple[int, ...] = ()) -> CutOut:
     settings = revise(profile("preview"), changes)
     conversion = Conversion(item=draft.identifier, settings=settings)
     outputs = _run("cut_out", source=_source(upload), conversion=conversion).outputs
-    facts = json.loads(home.store().path(outputs["facts"]).read_text(encoding="utf-8"))
+    facts = home.store().load_json(outputs["facts"])
     found = {name: pages.address(name, outputs[name], ".png") for name in ("picture", "matte")}
     return CutOut(**facts, **found)
 
@@ -109,7 +108,7 @@ def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bo
     if "footage" in subject.outputs:
         return []
     video = _run("drive_video", subject=subject, conversion=conversion)
-    ranking = json.loads(home.store().path(video.outputs["ranking"]).read_text(encoding="utf-8"))
+    ranking = home.store().load_json(video.outputs["ranking"])
     address = entry_address(video.outputs["films"])
     rows = sorted(ranking["candidates"], key=lambda row: int(row["number"]))
     return [Film(motion=row["name"], address=f"{address}{row['number']}.mp4") for row in rows]

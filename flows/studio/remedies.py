@@ -46,9 +46,15 @@ def _set(label: str, **values: Any) -> Candidate:
     return lambda _: Remedy(label, {name.replace("__", "."): value for name, value in values.items()})
 
 
+def _other_surface(settings: PipelineSettings) -> Remedy:
+    """Return a lower threshold, or the Gaussians' surface in place of the shape network's, which has no threshold."""
+    if settings.mesh.source == "prior" and settings.mesh.mode != "per_frame":
+        return Remedy("the surface of the Gaussians", {"mesh.source": "gaussians"})
+    return _times("a lower threshold", "mesh.density_threshold", factor=0.5)(settings)
+
+
 LONGER_MOTION = _times("twice the motion iterations", "motion.iterations")
 LONGER_SHAPE = _times("twice the shape iterations", "static.iterations")
-LOWER_THRESHOLD = _times("a lower threshold", "mesh.density_threshold", factor=0.5)
 FRAME_MESHES = _set("a mesh per frame", mesh__mode="per_frame")
 FINER_GRID = _times("a finer mesh grid", "mesh.grid", factor=1.5)
 
@@ -59,7 +65,7 @@ LOW: Mapping[str, tuple[Candidate, ...]] = {  # for values below the bounds, by 
     ),
     "silhouette": (LONGER_MOTION,),
     "consistency": (LONGER_SHAPE, _times("more views", "static.views")),
-    "agreement": (LOWER_THRESHOLD, FRAME_MESHES),
+    "agreement": (_other_surface, FRAME_MESHES),
     "sharpness": (_times("a larger texture", "mesh.texture_size", "mesh.render_size"), LONGER_SHAPE),
     "motion": (LONGER_MOTION,),
 }
@@ -69,7 +75,7 @@ HIGH: Mapping[str, tuple[Candidate, ...]] = {  # for values above them
         _times("faint splats pruned", "static.prune_opacity", factor=3),
         _times("small pieces removed", "mesh.min_component", factor=3),
     ),
-    "flaws": (LOWER_THRESHOLD, FINER_GRID),
+    "flaws": (_other_surface, FINER_GRID),
     "folds": (FRAME_MESHES, _times("a coarser mesh grid", "mesh.grid", factor=0.75)),
     "sharpness": (_times("a lower color rate", "static.color_lr", factor=0.5),),
     "motion": (_times("slower motion rates", "motion.plane_lr", "motion.network_lr", factor=0.5),),

@@ -61,17 +61,14 @@ class ServerApi:
         row: Row = answer.json()
         return row
 
-    async def runs(self, tags: Sequence[str] = (), states: Sequence[str] = (), limit: int = PAGE) -> list[Row]:
+    async def runs(self, tags: Sequence[str] = (), limit: int = PAGE) -> list[Row]:
         """Return runs that the page started, the newest first.
 
         Args:
             tags: all of which they have.
-            states: types of their state; empty: any.
             limit: largest number.
         """
-        wanted: Row = {"tags": {"all_": [TAG, *tags]}}
-        if states:
-            wanted["state"] = {"type": {"any_": list(states)}}
+        wanted = {"tags": {"all_": [TAG, *tags]}}
         return await self._filter(
             "flow_runs", {"flow_runs": wanted, "sort": "EXPECTED_START_TIME_DESC", "limit": limit}
         )
@@ -87,7 +84,7 @@ class ServerApi:
         return await self._filter("flow_runs", {"flow_runs": wanted, "sort": "START_TIME_ASC", "limit": PAGE})
 
     async def tasks(self, runs: Sequence[str]) -> list[Row]:
-        """Return the task runs of flow runs, in the order of their ends."""
+        """Return the task runs of flow runs, the latest end first."""
         return await self._filter(
             "task_runs", {"flow_runs": {"id": {"any_": list(runs)}}, "sort": "END_TIME_DESC", "limit": PAGE}
         )

@@ -14,7 +14,7 @@ from flows.engine.schedule import Schedule, format_left, keep_durations, load_du
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
 from flows.stages import planned_steps
-from flows.studio.server_api import ENDED, Row, ServerApi
+from flows.studio.server_api import Row, ServerApi
 from flows.studio.submission import asset_tag
 from flows.ui.pages import LIVE
 from steps.contract import Frozen
@@ -86,9 +86,6 @@ class RunStatus(Frozen):
     profile: str
     state: str
     message: str
-    attempt: int
-    created: str
-    seconds: float
     steps: tuple[StepStatus, ...] = ()
     left: str = ""
     picture: str = ""
@@ -118,9 +115,6 @@ def summary(run: Row) -> RunStatus:
         profile=str((run["parameters"].get("options") or {}).get("profile", "")),
         state=state,
         message=message_of(run),
-        attempt=run["run_count"],
-        created=run["created"],
-        seconds=round(run["estimated_run_time"] or 0.0, 1),
         asset=asset,
         is_batch="inputs" in run["parameters"],
     )
@@ -260,8 +254,3 @@ def _progress(artifacts: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, f
 
 def _seconds(time: str) -> float:
     return datetime.fromisoformat(time).timestamp()
-
-
-def is_active(run: Row) -> bool:
-    """Return true if a run has not ended."""
-    return run["state_type"] not in ENDED - {"CRASHED"}

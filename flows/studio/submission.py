@@ -3,7 +3,7 @@
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field
 
@@ -15,7 +15,7 @@ from flows.inputs.naming import check_name, clean_name
 from flows.studio.drafts import Draft, Upload
 from flows.ui import pages
 from steps.contract import LARGEST_SEED, Frozen
-from steps.profiles import profile, revise
+from steps.profiles import ProfileName, profile, revise
 
 MOST_VIEWS = 63
 GPU = " on a GPU"
@@ -46,7 +46,7 @@ class Submission(Frozen):
     """
 
     name: str = Field("", max_length=200)
-    profile: Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"] = "preview"
+    profile: ProfileName = "preview"
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
     motion: Motion | None = None
     box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field((), max_length=4)
@@ -57,7 +57,7 @@ class Submission(Frozen):
     batch: bool = False
 
 
-class Order(NamedTuple):
+class RunRequest(NamedTuple):
     """Run to be started.
 
     Attributes:
@@ -73,7 +73,7 @@ class Order(NamedTuple):
     tags: tuple[str, ...]
 
 
-def order(draft: Draft, wanted: Submission) -> Order:
+def convert(draft: Draft, wanted: Submission) -> RunRequest:
     """Return the run that converts a draft.
 
     Raises:
@@ -98,10 +98,10 @@ def order(draft: Draft, wanted: Submission) -> Order:
     else:
         parameters["cutout"] = {"mask": _mask(draft, wanted, first, key)}
         parameters["sides"] = {"views": [_view(draft, view, first, key) for view in wanted.views]}
-    return Order(_deployment(flow, title, wanted.profile), item, parameters, (draft_tag(draft), asset_tag(item)))
+    return RunRequest(_deployment(flow, title, wanted.profile), item, parameters, (draft_tag(draft), asset_tag(item)))
 
 
-def _batch(draft: Draft, wanted: Submission) -> Order:
+def _batch(draft: Draft, wanted: Submission) -> RunRequest:
     """Return the run that makes an asset of every file."""
     files = draft.uploads()
     if any(each.kind == "model" for each in files):
@@ -114,10 +114,10 @@ def _batch(draft: Draft, wanted: Submission) -> Order:
         "out": str(home.studio_assets() / f"batch-{key}"),
         "options": _options(wanted, with_motion=True),
     }
-    return Order(_deployment("catalog-to-4d", "Catalog", wanted.profile), name, parameters, (draft_tag(draft),))
+    return RunRequest(_deployment("catalog-to-4d", "Catalog", wanted.profile), name, parameters, (draft_tag(draft),))
 
 
-def again(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = None) -> Order:
+def again(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = None) -> RunRequest:
     """Return a run as an earlier one, with changed settings, into a folder of its own.
 
     Args:
@@ -137,7 +137,7 @@ def again(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = 
     return _same_deployment(run, parameters)
 
 
-def retry(run: Mapping[str, Any]) -> Order:
+def retry(run: Mapping[str, Any]) -> RunRequest:
     """Return a run equal to an earlier one, which goes on after its last finished step."""
     return _same_deployment(run, dict(run["parameters"]))
 
@@ -157,13 +157,13 @@ def asset_tag(item: str) -> str:
     return pages.key("asset", item)
 
 
-def _same_deployment(run: Mapping[str, Any], parameters: dict[str, Any]) -> Order:
+def _same_deployment(run: Mapping[str, Any], parameters: dict[str, Any]) -> RunRequest:
     source = next(name for name in ("model", "picture", "video", "inputs") if name in parameters)
     flow = "catalog" if source == "inputs" else source
     deployment = _deployment(f"{flow}-to-4d", flow.capitalize(), parameters["options"]["profile"])
     tags = tuple(tag for tag in run["tags"] if tag.startswith(("draft-", "asset-")))
     item = str(run["name"]) if source == "inputs" else Path(parameters[source]).stem
-    return Order(deployment, item, parameters, tags)
+    return RunRequest(deployment, item, parameters, tags)
 
 
 def _deployment(flow: str, title: str, profile_name: str) -> str:

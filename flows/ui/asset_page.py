@@ -1,6 +1,5 @@
 """Page of a finished asset in the Prefect UI: pictures, curves, gates, steps and links."""
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,7 +51,7 @@ def asset_page(item: str, finished: Sequence[StepRun], package: ArtifactRef, sto
     for result in (done.result for done in finished):
         for ref in result.outputs.values():
             if ref.media_type.endswith("curves+json"):
-                lines += curve_picture(json.loads(store.path(ref).read_text(encoding="utf-8")))
+                lines += curve_picture(store.load_json(ref))
     verdict = acceptance.load_verdict((done.result for done in finished), store)
     if verdict is not None:
         lines += ["## Gates", "", *acceptance.markdown(verdict)]

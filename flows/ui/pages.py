@@ -3,7 +3,6 @@
 import base64
 import hashlib
 import io
-import json
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -55,9 +54,9 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     lines += [f"> {markdown(note)}\n" for note in (*record.notes, *record.run_notes)]
     for ref in result.outputs.values():
         if ref.media_type.endswith("curves+json"):
-            lines += curve_table(json.loads(store.path(ref).read_text(encoding="utf-8")))
+            lines += curve_table(store.load_json(ref))
         if ref.media_type.endswith("gates+json"):
-            lines += acceptance.markdown(json.loads(store.path(ref).read_text(encoding="utf-8")))
+            lines += acceptance.markdown(store.load_json(ref))
     rows = {
         "compute_s": f"{record.duration_s:.1f}",
         "peak memory": f"{record.peak_memory_mb:.0f} MiB",

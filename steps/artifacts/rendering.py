@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames, pose_gaussians, states_between
 from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
@@ -109,17 +109,6 @@ def read_states(folder: Path, manifest: Manifest) -> States:
     fit = read_compact(folder / COMPACT)
     return lambda positions: pose_gaussians(
         fit.gaussians, fit.deformation, fit.frames, positions * fit.frames / manifest.frames
-    )
-
-
-def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
-    """Interpolate Gaussians that are given per frame linearly."""
-    return Gaussians(
-        interpolate_frames(states.means, positions),
-        interpolate_frames(states.log_scales, positions),
-        interpolate_frames(states.quats, positions),
-        states.opacity_logits,
-        states.harmonics,
     )
 
 

@@ -10,9 +10,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from steps.artifacts.archives import can_exist, stays_inside
-from steps.contract import shown
 from steps.sources.media_types import check_still
 from steps.sources.still_headers import read_header
 
@@ -138,11 +137,11 @@ def check_sheet(path: Path, index: BankIndex) -> None:
 def _check_name(path: Path, field: str, name: str) -> None:
     """Refuse names that lead out of the bank, and suffixes that would select another decoder than that of PNG."""
     if not stays_inside(name):
-        raise BadInput(f"{path} names a picture outside of the bank: {field} is {shown(name)}; name one in the bank")
+        raise BadInput(f"{path} names a picture outside of the bank: {field} is {quoted(name)}; name one in the bank")
     if not can_exist(name):
-        raise BadInput(f"{path}: {field} is {shown(name)}, which is too long for the name of a file")
+        raise BadInput(f"{path}: {field} is {quoted(name)}, which is too long for the name of a file")
     if not name.lower().endswith(".png"):
-        raise BadInput(f"{path}: {field} is {shown(name)}; sheets of a bank are PNG files, whose names end in .png")
+        raise BadInput(f"{path}: {field} is {quoted(name)}; sheets of a bank are PNG files, whose names end in .png")
 
 
 def _sentence(error: Mapping[str, Any]) -> str:
@@ -152,4 +151,4 @@ def _sentence(error: Mapping[str, Any]) -> str:
         return reason.removeprefix("Value error, ")
     if error["type"] == "missing":
         return f"{where} is missing"
-    return f"{where or 'the whole'} is {shown(error['input'])}, and {reason.removeprefix('Input ')}"
+    return f"{where or 'the whole'} is {quoted(error['input'])}, and {reason.removeprefix('Input ')}"

@@ -83,7 +83,7 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             splats, notes = read_spz(file.read_bytes())
             return OwnModel(splats=splats, ups=("y", "-y"), notes=notes)
         case ".glb" | ".gltf":
-            return _mesh(_whole_glb(file), settings)
+            return _mesh(embed_files(file), settings)
         case ".obj":
             text = file.read_bytes().decode("utf-8", "replace")
             model = read_obj(text, lambda name: _beside(file.parent, name), decode_picture, settings.max_faces)
@@ -100,21 +100,6 @@ def _merged(own: OwnModel, most: int) -> OwnModel:
         return own
     note = f"{len(own.splats)} splats were merged to {most}, which look alike (asset.max_splats)"
     return replace(own, splats=merge_gaussians(own.splats, most), notes=(*own.notes, note))
-
-
-def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
-    """Read a GLB or glTF beside its files.
-
-    Raises:
-        BadInput: it cannot be used.
-    """
-    return read_foreign_glb(_whole_glb(path), settings.max_faces)
-
-
-def _whole_glb(file: Path) -> bytes:
-    """Return a GLB or glTF with the files beside it in its binary chunk."""
-    content = file.read_bytes()
-    return embed_files(content if file.suffix == ".glb" else _glb_of(content), file.parent)
 
 
 def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
@@ -139,22 +124,20 @@ def _beside(folder: Path, name: str) -> bytes | None:
     return (folder / cleaned).read_bytes()
 
 
-def _glb_of(text: bytes) -> bytes:
-    """Return a GLB with the JSON of a glTF and no buffer."""
-    padded = text + b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(padded), b"JSON") + padded + struct.pack("<I4s", 0, b"BIN\0")
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
-def embed_files(content: bytes, folder: Path) -> bytes:
-    """Return a GLB whose buffers and images are all in its one binary chunk.
+def embed_files(file: Path) -> bytes:
+    """Return a GLB or glTF as a GLB whose buffers and images, also of files beside it, are in its one binary chunk.
 
     Raises:
-        BadInput: the container is corrupt, or a file that it names is missing.
+        BadInput: the file is corrupt, or a file that it names is missing.
     """
-    tree, binary = _chunks(content)
+    content, is_glb = file.read_bytes(), file.suffix == ".glb"
     try:
-        return _embedded(tree, binary, folder)
+        tree, binary = _chunks(content) if is_glb else (_tree(content), b"")
+    except (ValueError, struct.error, RecursionError) as error:
+        kind = "GLB" if is_glb else "glTF"
+        raise BadInput(f"the model is no {kind} 2.0 ({error}); export it again as GLB") from error
+    try:
+        return _embedded(tree, binary, file.parent)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(f"the model is a broken glTF ({error!r}); export it again") from error
 
@@ -196,23 +179,25 @@ def _embedded(tree: dict[str, Any], binary: bytes, folder: Path) -> bytes:
 
 def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     """Return the tree and the binary chunk of a GLB, which may be missing."""
-    try:
-        if content[:4] != b"glTF":
-            raise ValueError(f"it starts with {content[:4]!r}")
-        _, version, length = struct.unpack_from("<4sII", content)
-        size, kind = struct.unpack_from("<I4s", content, 12)
-        if version != 2 or kind != b"JSON" or 20 + size > len(content) or length > len(content):
-            raise ValueError(f"version {version}, {length} bytes declared, {len(content)} found")
-        tree = json.loads(content[20 : 20 + size])
-        if not isinstance(tree, dict):
-            raise ValueError("its JSON is no object")
-        binary = b""
-        if len(content) >= 28 + size:
-            count, _ = struct.unpack_from("<I4s", content, 20 + size)
-            binary = content[28 + size : 28 + size + count]
-        return tree, binary
-    except (ValueError, struct.error, RecursionError) as error:
-        raise BadInput(f"the model is no GLB 2.0 ({error}); export it again as GLB") from error
+    if content[:4] != b"glTF":
+        raise ValueError(f"it starts with {content[:4]!r}")
+    _, version, length = struct.unpack_from("<4sII", content)
+    size, kind = struct.unpack_from("<I4s", content, 12)
+    if version != 2 or kind != b"JSON" or 20 + size > len(content) or length > len(content):
+        raise ValueError(f"version {version}, {length} bytes declared, {len(content)} found")
+    tree = _tree(content[20 : 20 + size])
+    binary = b""
+    if len(content) >= 28 + size:
+        count, _ = struct.unpack_from("<I4s", content, 20 + size)
+        binary = content[28 + size : 28 + size + count]
+    return tree, binary
+
+
+def _tree(text: bytes) -> dict[str, Any]:
+    tree = json.loads(text)
+    if not isinstance(tree, dict):
+        raise ValueError("its JSON is no object")
+    return tree
 
 
 def _content(uri: str, folder: Path, what: str) -> bytes:

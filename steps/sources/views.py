@@ -9,9 +9,9 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from steps.artifacts.archives import stays_inside
-from steps.contract import Frozen, settings_errors, shown
+from steps.contract import Frozen, settings_errors
 
 VIEWS_JSON = "views.json"
 LARGEST_JSON = 16 * 2**20  # bytes
@@ -79,7 +79,7 @@ def read_views(folder: Path) -> GivenViews:
         raise BadInput(f"the views cannot be read: {error}; give them with --view, --turntable or --cameras") from error
     for name in filter(None, (*(view.file for view in given.views), given.turntable)):
         if not stays_inside(name) or not (folder / name).is_file():
-            raise BadInput(f"{VIEWS_JSON} names {shown(name)}, which is not among the views")
+            raise BadInput(f"{VIEWS_JSON} names {quoted(name)}, which is not among the views")
     return given
 
 
@@ -96,7 +96,7 @@ def parse_view(text: str) -> tuple[float, float, str]:
             raise ValueError
     except ValueError:
         raise BadInput(
-            f"{shown(text)} is no view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
+            f"{quoted(text)} is no view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
         ) from None
     azimuth, elevation = (*numbers, 0.0)[:2]
     check_direction(azimuth, elevation, text)
@@ -116,7 +116,7 @@ def check_direction(azimuth: float, elevation: float, name: str) -> None:
     """
     if not (abs(azimuth) <= 360 and abs(elevation) <= HIGHEST_DEG):  # NaN is out of range, too
         raise BadInput(
-            f"{shown(name)}: azimuth {azimuth:g} and elevation {elevation:g} are out of range; azimuths from -360 to "
+            f"{quoted(name)}: azimuth {azimuth:g} and elevation {elevation:g} are out of range; azimuths from -360 to "
             f"360 and elevations from -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are allowed"
         )
 
@@ -207,7 +207,7 @@ class Transforms(_Intrinsics):
             share = 0.5 / math.tan(self.camera_angle_x / 2)
         else:
             raise BadInput(
-                f"{shown(frame.file_path)} has no focal length: give fl_x, w and h in pixels, or camera_angle_x in "
+                f"{quoted(frame.file_path)} has no focal length: give fl_x, w and h in pixels, or camera_angle_x in "
                 "radians"
             )
         center = (x / width if x and width else 0.5, y / height if y and height else 0.5)

@@ -7,6 +7,7 @@ anything else       small files by name, each written at once: records about art
 
 import hashlib
 import io
+import json
 import os
 import stat
 import tempfile
@@ -14,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import IO, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
 from steps.contract import ArtifactRef, is_digest
@@ -111,6 +112,14 @@ class ArtifactStore:
         if not self._is_right(ref):
             raise self._damaged(ref)
         return file
+
+    def load_json(self, ref: ArtifactRef) -> Any:
+        """Return the content of a JSON artifact.
+
+        Raises:
+            ArtifactMissing: as `path`.
+        """
+        return json.loads(self.path(ref).read_text(encoding="utf-8"))
 
     def now(self) -> float:
         """Return the time of the clock behind `Entry.modified`, in seconds."""

@@ -10,11 +10,13 @@ import repository
 
 import flows.cli
 import flows.commands.endings
+from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from flows.inputs.manifest import parse_changes
 from flows.inputs.package_record import RECORD
 from flows.packages.report import BESIDE
 from steps.artifacts import packages
 from steps.profiles import PROFILES, profile, revise
+from steps.sources.banks import BankIndex
 
 README = repository.text("README.md")
 USAGE = repository.text("docs/usage.md")
@@ -123,6 +125,14 @@ def test_every_setting_in_a_document_can_be_set(path: str) -> None:
     pairs = re.findall(r"--set '?([^\s`']+=[^\s`']+)", repository.text(path))
     for pair in pairs:
         revise(profile("preview"), parse_changes([pair]))
+
+
+def test_the_examples_of_data_formats_are_valid() -> None:
+    page = repository.text("docs/data.md")
+    items = Scene.model_validate_json(repository.fenced(page, "## Scene")).items
+    default = SceneItem(package="demo").model_dump()
+    assert items[0].model_dump() == default
+    assert len(BankIndex.model_validate_json(repository.fenced(page, "## View bank")).views) == 2
 
 
 def test_the_readme_is_short() -> None:

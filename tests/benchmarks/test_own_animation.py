@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.own_animation import AZIMUTHS, SPAN, played, read_rigged
+from benchmarks.own_animation import AZIMUTHS, SPAN, played, read_mesh, read_rigged
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
 from dg4d_lib.errors import BadInput
-from steps.sources.models import read_mesh
 
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, xyzw

@@ -10,7 +10,7 @@ from small_package import FRAMES, cloud, gem, inputs, job, tracked
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GateSettings
-from dg4d_lib.assets.animated import Asset4D
+from dg4d_lib.assets.animated import Asset4D, states_between
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -19,7 +19,6 @@ from dg4d_lib.metrics.gates import GateInputs, evaluate_gates
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_png
-from steps.artifacts.rendering import states_between
 from steps.catalog import STEPS
 from steps.check_asset import LoadedAsset, collect_evidence, gates_as_json, run
 from steps.pack_asset import run as pack

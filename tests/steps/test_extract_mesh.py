@@ -51,7 +51,11 @@ def ball() -> Gaussians:
 
 
 def make_plan(
-    folder: Path, gaussians: Gaussians, mesh: MeshSettings = MESH, video: Path | None = None
+    folder: Path,
+    gaussians: Gaussians,
+    mesh: MeshSettings = MESH,
+    video: Path | None = None,
+    subject: Path | None = None,
 ) -> tuple[Job, StepReport]:
     """Plan the mesh of a cloud that begins one SHIFT beside its canonical place and goes on by one a frame."""
     motion = Framewise(FRAMES, len(gaussians))
@@ -64,7 +68,8 @@ def make_plan(
     settings = PREVIEW.model_copy(update={"mesh": mesh})
     job = Job(
         inputs={"gaussians": folder / "gaussians.ply", "motion": folder / "motion"}
-        | ({"driving_video": video} if video else {}),
+        | ({"driving_video": video} if video else {})
+        | ({"subject": subject} if subject else {}),
         outputs={
             "plan": folder / "plan",
             "tracked": folder / "tracked",
@@ -91,10 +96,9 @@ def extract(
 
     Facts are those of `extract_mesh`, with the notes of `plan_mesh` before its own.
     """
-    job, planned = make_plan(folder, gaussians, mesh, video)
+    job, planned = make_plan(folder, gaussians, mesh, video, subject)
     settings = step_settings("extract_mesh", PREVIEW.model_copy(update={"mesh": mesh}), **frames)
-    inputs = {**job.inputs, "plan": folder / "plan"} | ({"subject": subject} if subject else {})
-    facts = run(replace(job, inputs=inputs, settings=settings))
+    facts = run(replace(job, inputs={**job.inputs, "plan": folder / "plan"}, settings=settings))
     return job, replace(facts, notes=(*planned.notes, *facts.notes))
 
 
@@ -126,12 +130,12 @@ def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[
     picture = read_png(tracked[0] / "picture.png")
     assert picture.shape == (256, 4 * 256, 3)
     assert (picture.amin(-1) < 0.5).float().mean() > 0.05
-    assert "outlines agree with the Gaussians' to 9" in tracked[1].notes[0]
+    assert "agree with the Gaussians' to 9" in tracked[1].notes[0]
     assert not (tracked[0] / "meshes").exists()
 
 
 def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, StepReport]) -> None:
-    assert "at rest it is watertight, 1 component, 0 inverted" in tracked[1].notes
+    assert "at rest the mesh is watertight, 1 component, 0 inverted" in tracked[1].notes
 
 
 def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,7 +326,8 @@ def test_a_guessed_subject_has_the_surface_of_the_shape_network(tmp_path: Path, 
     apart = float(torch.cdist(vertices, surface.vertices).amin(1).mean())
     guessed = source == "prior"
     assert (apart < 0.01) is guessed
-    assert any("it is the shape network's surface of frame 0" in note for note in facts.notes) is guessed
+    assert any("the mesh is the shape network's surface of frame 0" in note for note in facts.notes) is guessed
+    assert any("outlines of the isosurface at density" in note for note in facts.notes) is not guessed
     assert (facts.weights == packaged.digests()) is guessed
 
 

@@ -302,7 +302,8 @@ def test_textures_beside_a_gltf_are_embedded_as_their_content_is(kind: str, tmp_
     Image.new("RGB", (4, 4)).save(tmp_path / "paint", kind)
     document = GltfDocument({})
     document.add("images", uri="paint")
-    reader = GlbReader(embed_files(document.to_bytes(), tmp_path))
+    (tmp_path / "model.gltf").write_text(json.dumps(document.tree))
+    reader = GlbReader(embed_files(tmp_path / "model.gltf"))
     (image,) = reader.tree["images"]
     assert image["mimeType"] == f"image/{kind}"
     assert bytes(reader.view(image["bufferView"])) == (tmp_path / "paint").read_bytes()
@@ -319,6 +320,9 @@ REFUSED = {
     ),
     "missing buffer": ({"model_gltf": json.dumps(
         {"asset": {"version": "2.0"}, "buffers": [{"uri": "a.bin", "byteLength": 4}]}).encode()}, "buffer .* missing"),
+    "no json": ({"model_gltf": b"{"}, r"no glTF 2\.0 \(Expecting"),
+    "no object": ({"model_gltf": b"[]"}, r"no glTF 2\.0 \(its JSON is no object"),
+    "no glb": ({"model_glb": b"{}"}, r"no GLB 2\.0 \(it starts with"),
     "splats without color": (
         {"model_ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nend_header\n"},
         "no splat colors",

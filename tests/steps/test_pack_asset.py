@@ -142,17 +142,29 @@ def test_another_frame_rate_keeps_the_length_and_the_frames(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("mode", "states", "reason"),
-    [("per_frame", FRAMES, "every frame has its own mesh"), ("tracked", 5, "at most 5 states")],
+    ("mode", "fps", "states", "reason"),
+    [
+        ("per_frame", 48.0, FRAMES, "every frame has its own mesh"),
+        ("tracked", 48.0, 5, "at most 5 states"),
+        ("tracked", 1.0, FRAMES, f"at least {FRAMES} states"),
+    ],
 )
 def test_a_rate_that_cannot_be_had_is_noted(
-    mode: str, states: int, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mode: str, fps: float, states: int, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (resample, pack_asset):
-        monkeypatch.setattr(module, "MAX_STATES", 5)
-    manifest = read_manifest(packed(tmp_path, mode, fps=2 * FPS, splats=False, spz=False, rig=False, usd=False))
+    monkeypatch.setattr(resample, "MAX_STATES", 5)
+    manifest = read_manifest(packed(tmp_path, mode, fps=fps, splats=False, spz=False, rig=False, usd=False))
     assert (manifest.frames, manifest.fps) == (states, pytest.approx(states / FRAMES * FPS))
-    assert f"the files have {manifest.fps:g} frames per second instead of 48 (pack.fps): {reason}" in manifest.notes
+    assert (
+        f"the files have {manifest.fps:g} frames per second instead of {fps:g} (pack.fps): {reason}" in manifest.notes
+    )
+
+
+def test_formats_that_lose_something_are_noted(tmp_path: Path) -> None:
+    folder = packed(tmp_path, height_m=1e-4, gltf={"components": 1}, rig=False, usd=False, splats=False)
+    notes = read_manifest(folder).notes
+    assert any("100% of the splats" in note and "pack.height_m" in note for note in notes)
+    assert any(note.startswith("asset.glb misses the motion by ") for note in notes)
 
 
 def test_levels_of_detail_have_their_share_of_the_triangles(tmp_path: Path) -> None:

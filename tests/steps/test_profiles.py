@@ -9,7 +9,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.rasterizer import backends
 from dg4d_lib.reconstruction.lgm import WORLD_SCALE
 from dg4d_lib.settings import Zero123PriorSettings
-from steps.profiles import CHANGED_KNOBS, PREVIEW, PROFILES, PipelineSettings, profile, revise, step_settings
+from steps.profiles import PREVIEW, PROFILES, RENAMED_SETTINGS, PipelineSettings, profile, revise, step_settings
 from steps.runtime.weights import license_of, weights_in
 
 
@@ -158,7 +158,7 @@ def test_a_step_gets_its_sections_and_values_of_the_run_and_nothing_else() -> No
         type(step_settings("fit_gaussians", turned)).model_validate({"rasterizer": "cpu"})
 
 
-@pytest.mark.parametrize(("old", "new"), CHANGED_KNOBS.items())
+@pytest.mark.parametrize(("old", "new"), RENAMED_SETTINGS.items())
 def test_the_old_name_of_a_knob_is_refused_with_the_new_one(old: str, new: str) -> None:
     with pytest.raises(BadInput, match=re.escape(f"the setting {old} is {f'now {new}' if new else 'gone'}")):
         revise(PREVIEW, {old: 1})
@@ -173,7 +173,7 @@ def test_the_old_name_of_a_knob_is_refused_with_the_new_one(old: str, new: str) 
 def test_new_names_are_knobs_of_some_profile() -> None:
     svd_lgm = revise(profile("reference"), {})
     image = revise(profile("paper"), {"refiner.kind": "image_to_image"})
-    for new in filter(None, CHANGED_KNOBS.values()):
+    for new in filter(None, RENAMED_SETTINGS.values()):
         path = new.split(" ")[0]
         found = []
         for settings in (PREVIEW, svd_lgm, image):

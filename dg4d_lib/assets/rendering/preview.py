@@ -19,7 +19,7 @@ from dg4d_lib.cameras.viewpoints import turntable, widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.mesh.render import SUPERSAMPLING, render_lit
+from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 
@@ -34,6 +34,7 @@ CODECS = {  # best first; without `cpu-independent`, x264's lookahead changed th
     "libx264": {"crf": "18", "preset": "medium", "x264-params": "cpu-independent=1"},
     "mpeg4": {"qscale": "3"},
 }
+MAX_DENOMINATOR = 65535  # of frame rates below 1; the numerators are smaller, and mpeg4 takes no larger ones
 BT709 = 1  # color primaries, transfer and matrix, as numbered in H.273
 CENTER, CORNER = (0.975, 0.975, 0.98), (0.84, 0.85, 0.87)  # colors of the background
 
@@ -97,13 +98,15 @@ def write_preview(
     repeats = max(1, min(ceil(SMOOTH_FPS / fps), MAX_PICTURES // (frames * settings.preview_turns)))
     positions = torch.arange(frames * repeats).repeat(settings.preview_turns) / repeats
 
+    lit = LitRenderer(PREVIEW_SAMPLES)
+
     def draw(part: slice, cameras: Sequence[OrbitCamera], background: Background) -> Pictures:
         states = pose_gaussians(gaussians, deformation, frames, positions[part])
         splats = render_over(background, states, cameras, rasterizer)
         if mesh_at is None:
             return splats
         meshes = [mesh_at(position) for position in positions[part].tolist()]
-        return torch.cat([splats, render_lit_over(background, meshes, cameras, PREVIEW_SAMPLES)], 2)
+        return torch.cat([splats, render_lit_over(background, meshes, cameras, lit)], 2)
 
     panels = 1 if mesh_at is None else 2
     orbit = Orbit(len(positions), fps * repeats, settings.preview_size, panels)
@@ -206,10 +209,10 @@ def render_lit_over(
     background: Float[Tensor, "h w 3"],
     meshes: Sequence[TexturedMesh],
     cameras: Sequence[OrbitCamera],
-    supersampling: int = SUPERSAMPLING,
+    lit: LitRenderer,
 ) -> Float[Tensor, "b h w 3"]:
     """Render every mesh under a light from its camera over a background image."""
-    pictures = (render_lit(mesh, camera, supersampling) for mesh, camera in zip(meshes, cameras, strict=True))
+    pictures = (lit.render(mesh, camera) for mesh, camera in zip(meshes, cameras, strict=True))
     return torch.stack([color * alpha + background * (1 - alpha) for color, alpha in pictures])
 
 
@@ -225,7 +228,7 @@ class Mp4Writer:
 
     def __init__(self, path: Path, codec: str, fps: float, height: int, width: int) -> None:
         self._container = av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"})
-        rate = Fraction(fps).limit_denominator(1001)
+        rate = Fraction(fps).limit_denominator(1001 if fps >= 1 else MAX_DENOMINATOR)
         self._stream = cast(av.VideoStream, self._container.add_stream(codec, rate, dict(CODECS[codec])))
         context = self._stream.codec_context
         self._stream.height, self._stream.width = height, width

@@ -1,7 +1,6 @@
 """Contact sheets: tiles of an asset from several azimuths at several frames, and of driving videos."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from dg4d_lib.cameras.viewpoints import widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.images import resize
+from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -60,14 +60,15 @@ def draw_contact_sheet(
     of_splats, of_meshes = cameras[: len(settings.sheet_azimuths_deg)], cameras[len(settings.sheet_azimuths_deg) :]
     for camera in of_splats:
         tiles = [
-            render_over(panel, _select_states(states, part), [camera] * len(part), rasterizer)
+            render_over(panel, states.states(part), [camera] * len(part), rasterizer)
             for part in torch.arange(columns).split(BATCH)
         ]
         rows.append(torch.cat(tiles))
     names = ["input", *(f"{azimuth_deg:g}°" for azimuth_deg in settings.sheet_azimuths_deg)]
     if mesh_at is not None:
         meshes = [mesh_at(int(frame)) for frame in frames]
-        rows += [render_lit_over(panel, meshes, [camera] * columns) for camera in of_meshes]
+        lit = LitRenderer()
+        rows += [render_lit_over(panel, meshes, [camera] * columns, lit) for camera in of_meshes]
         names += [f"mesh {azimuth_deg:g}°" for azimuth_deg in settings.sheet_mesh_azimuths_deg]
     return draw_tiles(torch.stack(rows), names, _timestamps(frames, video.fps))
 
@@ -112,10 +113,6 @@ def draw_tiles(
 
 def _timestamps(frames: Tensor, fps: float) -> list[str]:
     return [f"{frame / fps:.2f} s" for frame in frames.tolist()]
-
-
-def _select_states(states: Gaussians, index: Tensor) -> Gaussians:
-    return replace(states, means=states.means[index], log_scales=states.log_scales[index], quats=states.quats[index])
 
 
 def _video_tiles(video: DrivingVideo, frames: Tensor, size: int, scale: float = 1.0) -> Float[Tensor, "m size size 3"]:

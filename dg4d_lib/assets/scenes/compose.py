@@ -36,8 +36,8 @@ class AnimatedGlb:
 
     Attributes:
         file: the parsed GLB.
-        box_min: lower corner of the bounding box over all frames, world units.
-        box_max: upper corner of the bounding box over all frames, world units.
+        box_min: lower corner of the bounding box over all frames, meters.
+        box_max: upper corner of the bounding box over all frames, meters.
         foot: standing point: below the center of the box, at the lowest point of the first frame.
         duration_s: duration of the animation, seconds; 0 if there is none.
     """
@@ -149,7 +149,7 @@ class Actor:
 
     @property
     def origin(self) -> Vector:
-        """Position of the asset's origin in the scene, world units."""
+        """Position of the asset's origin in the scene, meters."""
         return np.array(self.item.position) - self.rotation.apply(self.glb.foot) * self.item.scale
 
     @property

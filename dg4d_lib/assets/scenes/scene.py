@@ -16,7 +16,7 @@ class SceneItem(Settings):
     name: str = Field("", max_length=200, description="name in the scene; empty: name of the folder")
     position: tuple[Number, Number, Number] = Field(
         (0.0, 0.0, 0.0),
-        description="position of its foot, world units: below the center of its bounding box over all frames, at the "
+        description="position of its foot, meters: below the center of its bounding box over all frames, at the "
         "lowest point of the first frame",
     )
     rotation_deg: tuple[Number, Number, Number] = Field(

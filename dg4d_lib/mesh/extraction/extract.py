@@ -2,8 +2,9 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from skimage.measure import marching_cubes
+from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import FitDiverged
@@ -18,8 +19,8 @@ LOWEST_SHARE = 0.25  # of the field's peak; the level used when the given one li
 
 STEP = 2**0.5  # ratio of successive trial levels
 MAX_STEPS = 4  # trial levels on either side of the given one
-# Views for comparing silhouettes: elevation and azimuth in degrees. The input view, where people compare, counts twice.
-SILHOUETTE_VIEWS_DEG = ((0, 0), (0, 0), (0, 90), (0, 180), (0, 270), (35, 45), (-35, 225))
+# Views for comparing silhouettes: elevation and azimuth in degrees. The first is the input view.
+SILHOUETTE_VIEWS_DEG = ((0, 0), (0, 90), (0, 180), (0, 270), (35, 45), (-35, 225))
 SILHOUETTE_SIZE = 192  # pixels
 
 
@@ -57,21 +58,20 @@ def select_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterize
 
     Returns:
         The best level, within a factor of five of the given one, and the intersection over union of its silhouettes
-        with those of the Gaussians over all views, in [0, 1].
+        with those of the Gaussians over all views, in [0, 1]. The input view, where people compare, counts twice.
 
     Raises:
         FitDiverged: the field is zero everywhere.
     """
-    cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in SILHOUETTE_VIEWS_DEG]
-    with torch.no_grad():
-        expected = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0] > ALPHA_THRESHOLD
+    cameras, expected = surrounding_silhouettes(gaussians, rasterize)
 
     def iou(candidate: float) -> float:
         if not float(field.values.max()) > candidate:
             return -1.0
         vertices, faces = extract_surface(field, candidate)
         rendered = rasterize_mesh(torch.from_numpy(vertices), torch.from_numpy(faces), cameras).faces >= 0
-        return float((rendered & expected).sum() / (rendered | expected).sum().clamp_min(1))
+        shared, either = ((rendered & expected).sum((1, 2)), (rendered | expected).sum((1, 2)))
+        return float((shared.sum() + shared[0]) / (either.sum() + either[0]).clamp_min(1))
 
     best = usable_level(field, level)
     best_iou = iou(best)
@@ -82,6 +82,21 @@ def select_level(field: DensityField, gaussians: Gaussians, rasterize: Rasterize
                 break
             best, best_iou = best * factor, candidate_iou
     return best, best_iou
+
+
+def surrounding_silhouettes(
+    gaussians: Gaussians, rasterize: Rasterizer
+) -> tuple[list[OrbitCamera], Bool[Tensor, "v h w"]]:
+    """Return cameras all around, that of the input view first, and the silhouettes of the Gaussians in them.
+
+    Args:
+        gaussians: one state.
+        rasterize: the splatting backend.
+    """
+    cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in SILHOUETTE_VIEWS_DEG]
+    with torch.no_grad():
+        alpha = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0]
+    return cameras, (alpha > ALPHA_THRESHOLD).cpu()
 
 
 def usable_level(field: DensityField, level: float) -> float:

@@ -22,6 +22,14 @@ DIAGONALS: tuple[Step, ...] = tuple(
 
 def cavities(solid: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
     """Mark empty samples that nothing reaches from outside, if balls of `LEAK` cells that fit in close their gaps."""
+    marked = np.zeros(solid.shape, bool)
+    for body in ndimage.find_objects(solid.view(np.int8)):  # one, or none if nothing is solid
+        around = tuple(slice(max(0, side.start - LEAK), side.stop + LEAK) for side in body)  # balls reach so far
+        marked[around] = _cavities(solid[around])
+    return marked
+
+
+def _cavities(solid: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
     padded = np.pad(solid, LEAK + 1)
     thick = _dilate(padded)
     room = ~_outside(thick) & ~thick

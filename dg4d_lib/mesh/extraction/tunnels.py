@@ -20,8 +20,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.kernels.compiling import configure_numba
 from dg4d_lib.mesh.extraction.density import DensityField
-from dg4d_lib.mesh.extraction.extract import SILHOUETTE_SIZE, SILHOUETTE_VIEWS_DEG
-from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
+from dg4d_lib.mesh.extraction.extract import surrounding_silhouettes
 from dg4d_lib.mesh.extraction.solid import ambiguous, cavities
 from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
@@ -52,7 +51,9 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
         return field
     (body,), margin = ndimage.find_objects(inside.astype(np.int8)), RADII[-1] + 2
     origin = field.origin.double().numpy() + (np.array([side.start for side in body]) - margin) * field.cell
-    padded, views = np.pad(field.values.numpy()[body], margin), _silhouettes(gaussians, rasterize)
+    padded = np.pad(field.values.numpy()[body], margin)
+    cameras, silhouettes = surrounding_silhouettes(gaussians, rasterize)
+    views = list(zip(cameras, silhouettes.numpy(), strict=True))
     fillings = (
         lambda: _hidden_tunnels(padded >= level, origin, field.cell, views),
         lambda: cavities(padded >= level),
@@ -142,15 +143,6 @@ def _is_new(solid, labels, part, i, j, k, a, b, c):
                 if earlier and labels[i + x, j + y, k + z] == part:
                     return False
     return True
-
-
-def _silhouettes(gaussians: Gaussians, rasterize: Rasterizer) -> list[View]:
-    """Return the silhouettes of the Gaussians with their cameras."""
-    views = dict.fromkeys(SILHOUETTE_VIEWS_DEG)
-    cameras = [OrbitCamera(e, a, width=SILHOUETTE_SIZE, height=SILHOUETTE_SIZE) for e, a in views]
-    with torch.no_grad():
-        alpha = rasterize(gaussians, cameras, torch.zeros(3)).alpha[..., 0]
-    return list(zip(cameras, (alpha > ALPHA_THRESHOLD).numpy(force=True), strict=True))
 
 
 def _least_covered(positions: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:

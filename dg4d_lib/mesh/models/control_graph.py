@@ -15,6 +15,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn import functional
 
 from dg4d_lib.mesh.neighbors import mesh_edges
 
@@ -64,6 +65,20 @@ class ControlGraph:
             return (values[:, self.indices] * self.weights[..., None]).sum(2)
         dense = self.weights.new_zeros(len(self.weights), len(self.nodes))  # the gradient of indexing adds in any order
         return dense.scatter_(1, self.indices, self.weights) @ values
+
+    def blend_rotations(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t v 4"]:
+        """Return the weighted mean of the nodes' rotations at every point, unit quaternions.
+
+        A quaternion and its negative are one rotation: each is taken with the sign that is nearer to the quaternion of
+        the point's strongest node.
+
+        Args:
+            quats: of the nodes, wxyz, unit.
+        """
+        turns = quats[:, self.indices]  # t v k 4
+        strongest = self.indices.gather(1, self.weights.argmax(1, keepdim=True))
+        weights = torch.where((turns * quats[:, strongest]).sum(-1) < 0, -self.weights, self.weights)
+        return functional.normalize((turns * weights[..., None]).sum(2), dim=-1)
 
     def at_ends(self, values: Float[Tensor, "t m c"]) -> tuple[Float[Tensor, "t e c"], Float[Tensor, "t e c"]]:
         """Return the nodes' values at both ends of the edges; their gradient is the same in every run."""

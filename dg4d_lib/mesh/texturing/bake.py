@@ -56,6 +56,9 @@ Draw = Callable[[Sequence[OrbitCamera]], Pictures]
 GradedPictures = tuple[
     Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]
 ]  # color, grade, depth, and the least depth nearby: see `grade_pixels`
+Covered = tuple[
+    Int[Tensor, " p"], Int[Tensor, " p"], Int[Tensor, "p 3"], Float[Tensor, "p 3"]
+]  # row and column of texels, and the corners of their triangle with barycentric weights
 
 
 @dataclass(frozen=True)
@@ -159,10 +162,8 @@ def locate_texels(
     return placed_texels(*covered_texels(faces, uvs, size), vertices, normals)
 
 
-def covered_texels(
-    faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int
-) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"], Int[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return row and column of the texels in charts, and the corners of their triangle with barycentric weights.
+def covered_texels(faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int) -> Covered:
+    """Return the texels in charts.
 
     Texel centers are at (index + 0.5) / size.
     """

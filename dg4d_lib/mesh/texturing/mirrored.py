@@ -18,6 +18,7 @@ from dg4d_lib.mesh.texturing.bake import (
     INPUT_FLATTER,
     MIN_COSINE,
     OUTLINE,
+    Covered,
     PosedSurface,
     Texels,
     add_views,
@@ -60,7 +61,8 @@ def mirror_texture(
     add_views(images, [camera], view, [(FLATTEST, 1.0)], mirrored)
     weight = nearness * torch.from_numpy(mirrored[:, 3])
     found = (weight > 0).nonzero()[:, 0]
-    shown = _weights_of(footage, [part[found] for part in covered], mesh.faces)
+    rows, columns, corners, shares = (part[found] for part in covered)
+    shown = _weights_of(footage, (rows, columns, corners, shares), mesh.faces)
     share = plane.trust * weight[found] / (weight[found] + SHOWN * shown + GUESSED)
     colors = mesh.texture[texels.rows, texels.columns]
     taken = torch.from_numpy(mirrored[found, :3] / mirrored[found, 3:])
@@ -69,9 +71,7 @@ def mirror_texture(
     return texture, int((share > 0.5).sum()) / max(1, len(colors))
 
 
-def _weights_of(
-    footage: Sequence[PosedSurface], covered: Sequence[Tensor], faces: Int[Tensor, "f 3"]
-) -> Float[Tensor, " p"]:
+def _weights_of(footage: Sequence[PosedSurface], covered: Covered, faces: Int[Tensor, "f 3"]) -> Float[Tensor, " p"]:
     """Return the weights that frames have in some texels, summed over frames; see `covered_texels`."""
     total = np.zeros((len(covered[0]), 4), np.float32)
     for posed in footage:

@@ -1,9 +1,11 @@
 """Interpolation between frames and from the last frame to the first."""
 
+from functools import partial
+
 import pytest
 import torch
 
-from dg4d_lib.assets.animated import interpolate_frames, pose_gaussians
+from dg4d_lib.assets.animated import interpolate_frames, pose_gaussians, states_between
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
@@ -20,12 +22,16 @@ def test_the_animation_returns_from_the_last_frame_to_the_first(red_dot: Gaussia
     torch.testing.assert_close(states.log_scales[-1], red_dot.log_scales)
 
 
-def test_a_full_turn_goes_on_where_it_closes(red_dot: Gaussians) -> None:
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_full_turn_goes_on_where_it_closes(red_dot: Gaussians, stored: bool) -> None:
     """Turned by 300 degrees, the quaternion is nearer to the negative of the first one."""
     angles = torch.tensor([0.0, 100.0, 200.0, 300.0]).deg2rad() / 2
     turn = Framewise(4, 1).requires_grad_(False)
     turn.table[:, 0, 6], turn.table[:, 0, 9] = angles.cos() - 1, angles.sin()
-    found = quat_to_rotmat(pose_gaussians(red_dot, turn, 4, torch.tensor([3.0, 3.5, 4.0])).quats[:, 0])
+    posed = partial(pose_gaussians, red_dot, turn, 4)
+    if stored:
+        posed = partial(states_between, posed(torch.arange(4.0)))
+    found = quat_to_rotmat(posed(torch.tensor([3.0, 3.5, 4.0])).quats[:, 0])
     expected = torch.tensor([300.0, 330.0, 360.0]).deg2rad()
     torch.testing.assert_close(found[:, 0, 0], expected.cos(), atol=1e-6, rtol=0)
     torch.testing.assert_close(found[:, 1, 0], expected.sin(), atol=1e-6, rtol=0)

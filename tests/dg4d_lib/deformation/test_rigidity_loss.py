@@ -31,6 +31,20 @@ def test_stretching_costs():
     assert rigidity_loss(states, *neighborhoods(states.means[0])) > 1e-3
 
 
+def test_no_gaussian_is_its_own_neighbor() -> None:
+    """Of the four at one place, all are equally near."""
+    indices, weights = neighborhoods(torch.tensor([[0.0, 0, 0]] * 4 + [[1.0, 0, 0]]), 2)
+    assert indices.shape == weights.shape == (5, 2)
+    assert (indices != torch.arange(5)[:, None]).all()
+    assert weights.tolist() == [[1, 1]] * 4 + [[0, 0]]
+
+
+def test_a_single_gaussian_has_no_neighbors_and_costs_nothing() -> None:
+    cloud = blob(2, 0.05, torch.Generator().manual_seed(0)).subset(slice(1))
+    states = Gaussians(torch.randn(2, 1, 3), torch.zeros(2, 1, 3), torch.ones(2, 1, 4), *list(vars(cloud).values())[3:])
+    assert rigidity_loss(states, *neighborhoods(cloud.means)) == 0
+
+
 def pairs(times: int) -> tuple[torch.Tensor, ...]:
     """Return random positions and quaternions of 300 Gaussians, and their neighbors, in float64."""
     generator = torch.Generator().manual_seed(1)

@@ -58,6 +58,10 @@ def test_the_noise_levels_are_those_of_the_real_scheduler() -> None:
     torch.testing.assert_close(times, scheduler.timesteps, rtol=1e-5, atol=1e-6)
 
 
+def test_a_single_noise_level_is_the_largest() -> None:
+    assert karras_sigmas(1) == pytest.approx((700, 0))
+
+
 @pytest.mark.parametrize(
     ("strength", "index", "sigma"), [(0.4, 15, 3.870), (0.3, 17, 1.2732), (0.25, 18, 0.678), (0.2, 20, 0.157)]
 )

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from dg4d_lib.fitting.node_motion import NodeBasis, NodeVariables
+from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
@@ -48,6 +48,15 @@ def test_rotations_of_one_side_swing_it_and_keep_its_length(plate: ControlGraph)
     before, after = plate.nodes[tip] - plate.nodes[root], moved[tip] - moved[root]
     assert float(after.norm() / before.norm()) == pytest.approx(1, abs=0.02)
     assert math.atan2(float(after[1]), float(after[0])) == pytest.approx(ANGLE, abs=0.03)
+
+
+def test_a_quaternion_and_its_negative_are_one_rotation(plate: ControlGraph) -> None:
+    count = len(plate.nodes)
+    quats = quats_about_z(2.5 * plate.nodes[:, 0])  # from -143 to 143 degrees
+    signs = torch.tensor([1.0, -1.0])[torch.arange(count) % 2, None]
+    rest = torch.zeros(1, count, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3)
+    plain, mixed = (NodeMotion(one, *rest).rotations(plate) for one in (quats, signs * quats))
+    torch.testing.assert_close(quat_to_rotmat(mixed), quat_to_rotmat(plain))
 
 
 @pytest.mark.parametrize("integrated", [False, True])

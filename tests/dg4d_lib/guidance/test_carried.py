@@ -1,6 +1,9 @@
 """Fields carried by the video: a rigid box that turns in the image plane keeps its back."""
 
 import math
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.guidance import carried as module
 from dg4d_lib.guidance.carried import EDGE_ON, CarriedFields, carry
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.learned import LearnedShapes
@@ -105,16 +109,47 @@ def test_a_guessed_first_frame_is_carried_along_with_turns_in_the_picture_and_no
         assert least <= ((some - own) / (all_of_it - own))[differs].median() <= most
 
 
+def test_threads_follow_the_video_together_and_no_further_than_they_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    followed = []
+
+    def match(pictures: list[Tensor]) -> Iterator[Correspondence]:
+        pixels = torch.stack(torch.meshgrid(*[torch.arange(SIZE).float()] * 2, indexing="ij"), -1)
+        for frame in range(len(pictures)):
+            time.sleep(0.05)  # other threads ask meanwhile
+            followed.append(frame)
+            yield Correspondence(pixels, torch.ones(SIZE, SIZE))
+
+    monkeypatch.setattr(module, "match_first_frame", match)
+    fields = CarriedFields(_Known(box(0)), box(0), [picture(0)] * 5)
+    with ThreadPoolExecutor(4) as pool:
+        assert len(list(pool.map(fields.predict, (2, 0, 1, 2)))) == 4
+    assert followed == [0, 1, 2]
+
+
+def test_a_guessed_first_frame_is_predicted_once() -> None:
+    guess = _Known(box(0))
+    fields = CarriedFields(guess, None, [picture(0), picture(TURN_DEG)], 0.2)
+    given = CarriedFields(guess, guess.predict(0), [picture(0), picture(TURN_DEG)], 0.2)
+    assert guess.asked == [0, 0]
+    for frame, asked in ((0, [0]), (1, [1, 1])):  # by those that were given their first frame; by both
+        guess.asked.clear()
+        one, other = fields.predict(frame), given.predict(frame)
+        assert guess.asked == asked
+        assert torch.equal(one.logits, other.logits) and torch.equal(one.hidden, other.hidden)
+
+
 class _Known:
     """One field, known."""
 
     def __init__(self, field: ShapeField) -> None:
         self._field = field
+        self.asked: list[int] = []
 
     def __len__(self) -> int:
         return 1
 
     def predict(self, frame: int) -> ShapeField:
+        self.asked.append(frame)
         return self._field
 
 

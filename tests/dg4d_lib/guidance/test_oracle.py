@@ -23,6 +23,8 @@ def test_it_finds_the_pose_and_the_frame():
     views = [GuidanceView(CAMERAS[1], 2), GuidanceView(OrbitCamera(20, -22.5, width=4, height=4), 0)]
     color, coverage = bank().clean(views)
     assert (color[:, 0, 0, 0] * 255).round().tolist() == [150, 100]
+    rounded = GuidanceView(OrbitCamera(0, -1e-14, width=4, height=4), 2)  # a turntable closes with such an azimuth
+    assert (bank().clean([rounded])[0] * 255).round()[0, 0, 0, 0] == 50
     assert (coverage == 1).all()
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from dg4d_lib.metrics.image import iou, psnr, resize_square
+from dg4d_lib.errors import BadInput
+from dg4d_lib.metrics.image import as_float, iou, psnr, resize_square
 
 
 def noise(seed: int, *shape: int) -> torch.Tensor:
@@ -33,6 +34,17 @@ def test_psnr_in_a_region_ignores_what_lies_outside() -> None:
 
 def test_psnr_of_an_empty_region_is_60() -> None:
     assert psnr(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2, 3), torch.zeros(1, 2, 2, 1)).item() == 60
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_psnr_in_half_precision_is_that_in_float32(dtype: torch.dtype) -> None:
+    first, second = (noise(seed, 1, 256, 256, 3).to(dtype) for seed in (0, 1))
+    torch.testing.assert_close(psnr(first, second), psnr(first.float(), second.float()))
+
+
+def test_integers_are_refused() -> None:
+    with pytest.raises(BadInput, match=r"given torch\.uint8; divide uint8 by 255"):
+        as_float(torch.zeros(1, 2, 2, 3, dtype=torch.uint8))
 
 
 def test_iou_of_two_shifted_squares() -> None:

@@ -49,6 +49,17 @@ def test_flicker_is_the_difference_of_changes_where_the_subject_is() -> None:
     assert flicker(brighter, torch.zeros_like(brighter), torch.zeros_like(region)) == 0
 
 
+def test_half_precision_gives_the_values_of_float32() -> None:
+    """The sum of all changes is beyond what float16 holds, and the least one is below."""
+    frames = torch.rand(3, 160, 160, 3, generator=torch.Generator().manual_seed(0)).half()
+    region = torch.ones(3, 160, 160, 1).half()
+    assert motion_amount(frames, frames) == 1
+    assert temporal_error(frames[:1].expand_as(frames), frames) == pytest.approx(1)
+    assert temporal_error(WALK[:1].expand_as(WALK).half(), WALK[:1].expand_as(WALK).half()) == 0
+    found = flicker(frames, 0 * frames, region)
+    torch.testing.assert_close(found, flicker(frames.float(), 0 * frames.float(), region.float()))
+
+
 def test_a_small_misplacement_is_forgiven_and_a_large_one_is_not() -> None:
     near, far = (temporal_error(dot([10 + off, 20 + off, 30 + off, 40 + off]), WALK) for off in (1, 20))
     assert near < 0.45

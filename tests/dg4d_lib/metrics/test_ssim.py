@@ -53,6 +53,11 @@ def test_value_and_gradient_are_those_of_the_definition(height, width, dtype, va
     assert (gradient - expected_gradient).norm() / expected_gradient.norm() < gradient_error
 
 
+def test_half_precision_is_computed_in_float32() -> None:
+    images, truth = (value.half() for value in pictures(20, 30))
+    torch.testing.assert_close(ssim(images, truth), ssim(images.float(), truth.float()))
+
+
 def test_equal_pictures_have_one_and_no_gradient() -> None:
     images = pictures(20, 30)[0].float().requires_grad_()
     found = ssim(images, images.detach())

@@ -73,12 +73,16 @@ class StandIn(ModuleType):
             cloud = Gaussians(mean, scale.log(), quat, opacity.logit(), rgb_to_sh(color))
             for pose, lens in zip(poses, lenses, strict=True):
                 camera = Pinhole(width=width, height=height, pose=pose, lens=float(lens[0, 0]))
-                splats.append(reference._project(cloud, camera))
+                splats.append(reference._project(cloud, camera, torch.zeros(n, 2)))
             backs.extend(behind)
         centers = torch.stack([view.means2d for view in splats]).reshape(*batch, views, n, 2)
         for view, own in zip(splats, centers.reshape(-1, n, 2), strict=True):
             view.means2d = own
-        pictures = [reference._render(view, behind, height, width) for view, behind in zip(splats, backs, strict=True)]
+        pictures = []
+        for view, behind in zip(splats, backs, strict=True):
+            visible, drawn = reference._sorted_by_depth(view, height, width)
+            chosen = reference._Splats(*(value[drawn] for value in vars(view).values()))
+            pictures.append((*reference._render(chosen, behind, height, width), visible))
         color, alpha, depth, visible = (torch.stack(part).float() for part in zip(*pictures, strict=True))
         radii = (4 * visible).int()[..., None].expand(-1, -1, 2).reshape(centers.shape)
         shape = (*batch, views, height, width)

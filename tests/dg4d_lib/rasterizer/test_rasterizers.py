@@ -218,6 +218,20 @@ def test_nothing_seen_gives_zero_gradients(rasterize, blobs, drawn, gradients):
     assert all(gradient.eq(0).all() for gradient in gradients(picture, leaves).values())
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])  # with gsplat, exp has no gradient where it overflows
+@pytest.mark.parametrize(("height", "log_scale"), [(2.0, -3.0), (0.0, 400.0)])
+def test_what_cannot_be_projected_has_no_gradients(height, log_scale, rasterize, blobs, drawn, gradients):
+    """A mean in the plane of the camera divides by zero, and a huge scale overflows."""
+    cloud = blobs([(0.0, 0.0, 0.0), (0.0, 0.0, height)])
+    cloud.log_scales[1] = log_scale
+    rendering, leaves = drawn(rasterize, cloud, [FRONT], torch.float32)
+    assert rendering.visible.tolist() == [[True, False]]
+    found = gradients(rendering, leaves)
+    assert found.pop("means2d_offsets")[0, 1].eq(0).all()
+    assert all(gradient[0].isfinite().all() and gradient[1].eq(0).all() for gradient in found.values())
+    assert found["means"][0].any()
+
+
 def test_white_behind_everything_is_white(rasterize, blobs):
     white = rasterize(blobs([(0, 0, 0)], colors=[(1, 1, 1)]), [FRONT], torch.ones(3))
     torch.testing.assert_close(white.color, torch.ones_like(white.color), atol=2e-7, rtol=0)

@@ -9,6 +9,7 @@ from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.settings import VideoModelSettings
 from dg4d_lib.video import matting
 from dg4d_lib.video.canvas import cut_out
+from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.svd import StableVideo
 
 pytestmark = pytest.mark.usefixtures("quick_segmentation")
@@ -54,19 +55,23 @@ def rng(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+def generate(maker: StableVideo, subject: Tensor, seed: int) -> DrivingVideo:
+    return maker.generate_all(subject, [rng(seed)])[0]
+
+
 def test_the_video_has_the_wanted_length_and_size_and_follows_the_generator(model: VideoModel, subject: Tensor) -> None:
     maker = StableVideo(SETTINGS, model)
-    video = maker.generate(subject, rng(3))
+    video = generate(maker, subject, 3)
     assert video.frames.shape == (FRAMES, SIZE, SIZE, 3) and video.fps == 7
-    assert torch.equal(video.frames, maker.generate(subject, rng(3)).frames)
-    assert not torch.equal(video.frames, maker.generate(subject, rng(4)).frames)
+    assert torch.equal(video.frames, generate(maker, subject, 3).frames)
+    assert not torch.equal(video.frames, generate(maker, subject, 4).frames)
 
 
 @pytest.mark.slow
 def test_several_candidates_are_those_of_their_seeds(model: VideoModel, subject: Tensor) -> None:
     maker = StableVideo(SETTINGS, model)
     both = maker.generate_all(subject, [rng(3), rng(4)])
-    alone = maker.generate(subject, rng(4))
+    alone = generate(maker, subject, 4)
     torch.testing.assert_close(both[1].frames, alone.frames, rtol=0, atol=3e-4)  # sums of float32 in another order
 
 
@@ -82,7 +87,7 @@ def test_the_subject_stands_in_the_middle_of_a_white_canvas_and_comes_back_cut_o
 ) -> None:
     settings = SETTINGS.model_copy(update={"height": height, "width": width})
     known = Known(model.unet, model.vae, model.image_encoder, settings.model, model.device)
-    video = StableVideo(settings, known).generate(subject, rng(0))
+    video = generate(StableVideo(settings, known), subject, 0)
     side = min(height, width)
     assert known.canvas.shape == (height, width, 3)
     assert (known.canvas[0] > 0.99).all() and (known.canvas[:, 0] > 0.99).all()
@@ -101,7 +106,7 @@ def test_where_nothing_can_be_told_the_outline_stays_and_it_is_said(model: Video
             return torch.full((len(latents), 64, 64, 3), 0.5)
 
     maker = StableVideo(SETTINGS, Gray(model.unet, model.vae, model.image_encoder, SETTINGS.model, model.device))
-    video = maker.generate(subject, rng(0))
+    video = generate(maker, subject, 0)
     assert torch.equal(video.alpha, subject[..., 3:].expand(FRAMES, -1, -1, -1))
     assert any("keeps the outline" in note for note in maker.notes)
 

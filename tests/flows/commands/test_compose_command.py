@@ -123,7 +123,7 @@ def test_either_packages_or_a_scene_file_are_needed(shelf: Path, packages: tuple
         ({"items": []}, r"items = \[\]: Tuple should have at least 1 item"),
         (
             {"items": [{"package": "gem"}], "lights": 3},
-            "the scene has an unknown field 'lights'; allowed: items, duration_s, fps",
+            "scene has an unknown field 'lights'; allowed: items, dur",
         ),
         ({"items": [{"package": "gem", "sclae": 2}]}, r"items\[0\] has an unknown field 'sclae'; allowed: .*loop$"),
         ({"items": [{"name": "gem"}]}, r"items\[0\] has no package, which is required$"),
