@@ -154,7 +154,7 @@ def run(job: Job) -> StepReport:
             mesh = tracked.mesh
             notes = [
                 *notes,
-                f"colors of the far side: for {share:.0%} of the texture, the mirror image of the near side",
+                f"far side: {share:.0%} of the texture is the mirror image of the near side",
             ]
         write_tracked(job.outputs["tracked"], tracked)
         kind = "isosurface of the Gaussians" if guesses is None else "shape network's surface"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dg4d_lib.deformation.interface import Deformation
@@ -62,10 +62,8 @@ def pose_gaussians(
 
 def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
     """Interpolate Gaussians that are given per frame."""
-    before = positions.floor().long()
-    share = (positions - before).to(states.means)[:, None, None]
-    count = len(states.means)
-    return _mixed(states.states(before % count), states.states((before + 1) % count), share)
+    before, after, share = _neighbors(positions, len(states.means))
+    return _mixed(states.states(before), states.states(after), share.to(states.means))
 
 
 def _mixed(states: Gaussians, others: Gaussians, share: Float[Tensor, "b 1 1"]) -> Gaussians:
@@ -81,6 +79,13 @@ def _mixed(states: Gaussians, others: Gaussians, share: Float[Tensor, "b 1 1"]) 
 
 def interpolate_frames(values: Float[Tensor, "t n c"], positions: Float[Tensor, " m"]) -> Float[Tensor, "m n c"]:
     """Interpolate values per frame linearly, as players of a GLB do."""
+    before, after, share = _neighbors(positions, len(values))
+    return torch.lerp(values[before], values[after], share.to(values))
+
+
+def _neighbors(
+    positions: Float[Tensor, " m"], frames: int
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, "m 1 1"]]:
+    """Return the frames before and after positions, and the share of the one after."""
     before = positions.floor().long()
-    share = (positions - before).to(values)[:, None, None]
-    return torch.lerp(values[before % len(values)], values[(before + 1) % len(values)], share)
+    return before % frames, (before + 1) % frames, (positions - before)[:, None, None]

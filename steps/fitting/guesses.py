@@ -1,4 +1,4 @@
-"""What meshes take from the shape network: shapes and mirror planes."""
+"""Shapes and mirror planes that the shape network predicts, for meshes."""
 
 from pathlib import Path
 

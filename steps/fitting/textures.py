@@ -10,7 +10,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.images import color_over_white
-from dg4d_lib.mesh.render import render_mesh, smooth_normals
+from dg4d_lib.mesh.render import render_mesh, smooth_normals, vertex_groups
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import Draw, PosedSurface, bake_texture
 from dg4d_lib.mesh.texturing.chart_packing import THOROUGH, Effort
@@ -103,10 +103,11 @@ def mirrored(tracked: TrackedMesh, video: DrivingVideo, plane: MirrorPlane) -> t
     def moved(frame: int) -> TexturedMesh:
         return replace(tracked.mesh, vertices=tracked.mesh.vertices + tracked.offsets[frame])
 
-    footage = []
+    footage, groups = [], vertex_groups(tracked.mesh)
     for frame in evenly_spaced(len(video), COLORED):
         posed = moved(frame)
-        footage.append(PosedSurface(posed.vertices, smooth_normals(posed), video.frames[frame], video.alpha[frame]))
+        normals = smooth_normals(posed, groups)
+        footage.append(PosedSurface(posed.vertices, normals, video.frames[frame], video.alpha[frame]))
     texture, share = mirror_texture(moved(round(tracked.reference_frame)), footage, plane)
     return replace(tracked, mesh=replace(tracked.mesh, texture=texture)), share
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import OpenImageIO as oiio
@@ -38,7 +38,7 @@ from dg4d_lib.settings import MeshSettings
 SHARPNESS = 2  # exponent of a view's weight in the cosine above the minimum; views blend without seams
 INPUT_WEIGHT = 200.0  # weight of the input view relative to others; only its colors come from a photograph
 MIN_COSINE = 0.5  # texels seen at a more oblique angle are not colored
-INPUT_FLATTER = 0.6  # factor of `MIN_COSINE` in the input view: a stretched true color beats a guessed one
+INPUT_MIN_COSINE = 0.6 * MIN_COSINE  # likewise in the input view: a stretched true color beats a guessed one
 INSIDE = 2  # grade of a pixel inside a silhouette; 1 along it, 0 outside
 OUTLINE = 2  # width of the unreliable band along silhouettes and occluding edges, pixels
 LAST_RESORT = 1e-4  # weight of oblique views and of the unreliable band, used only where no better view exists
@@ -56,9 +56,6 @@ Draw = Callable[[Sequence[OrbitCamera]], Pictures]
 GradedPictures = tuple[
     Float[Tensor, "b h w 3"], UInt8[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]
 ]  # color, grade, depth, and the least depth nearby: see `grade_pixels`
-Covered = tuple[
-    Int[Tensor, " p"], Int[Tensor, " p"], Int[Tensor, "p 3"], Float[Tensor, "p 3"]
-]  # row and column of texels, and the corners of their triangle with barycentric weights
 
 
 @dataclass(frozen=True)
@@ -78,6 +75,22 @@ class PosedSurface:
     color: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w 1"]
     weight: float = 1.0
+
+
+class CoveredTexels(NamedTuple):
+    """Texels in charts; their centers are at (index + 0.5) / size.
+
+    Attributes:
+        rows: row in the texture.
+        columns: column in the texture.
+        corners: of their triangles, indices of vertices.
+        shares: barycentric weights of the corners.
+    """
+
+    rows: Int[Tensor, " p"]
+    columns: Int[Tensor, " p"]
+    corners: Int[Tensor, "p 3"]
+    shares: Float[Tensor, "p 3"]
 
 
 @dataclass(frozen=True)
@@ -123,18 +136,12 @@ def bake_texture(
         a seam have the same colors.
     """
     size, side = settings.texture_size, settings.render_size
-    rows, columns, corners, shares = covered_texels(faces, uvs, size)
-    texels = placed_texels(rows, columns, corners, shares, vertices, normals)
+    covered = covered_texels(faces, uvs, size)
+    texels = placed_texels(covered, vertices, normals)
     if len(texels.rows) == 0:  # all triangles are smaller than a texel
         return torch.full((size, size, 3), 0.5)
     total = np.zeros((len(texels.rows), 4), np.float32)  # sums of weight * color and of weight
-    flattest = INPUT_FLATTER * MIN_COSINE
-    for posed in footage:
-        camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
-        moved = placed_texels(rows, columns, corners, shares, posed.vertices, posed.normals)
-        reach = max(1, round(OUTLINE * camera.width / side))  # the footage may be coarser than the renders
-        pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
-        add_views(moved, [camera], pictures, [(flattest, INPUT_WEIGHT * posed.weight)], total)
+    add_footage(footage, covered, faces, side, INPUT_WEIGHT, total)
     cameras = [OrbitCamera(width=side, height=side), *baking_views(side)]
     for start in range(0, len(cameras), VIEWS_AT_ONCE):
         batch = cameras[start : start + VIEWS_AT_ONCE]
@@ -142,7 +149,7 @@ def bake_texture(
         renders = grade_pixels(color, alpha[..., 0], batch, vertices, faces, OUTLINE)
         rules = [(MIN_COSINE, 1.0)] * len(batch)
         if start == 0 and not footage:
-            rules[0] = flattest, INPUT_WEIGHT
+            rules[0] = INPUT_MIN_COSINE, INPUT_WEIGHT
         add_views(texels, batch, renders, rules, total)
     weight = torch.from_numpy(total[:, 3:])
     seen = weight[:, 0] > 0
@@ -159,32 +166,23 @@ def locate_texels(
     size: int,
 ) -> Texels:
     """Locate the texels of a square texture on the surface; texel centers are at (index + 0.5) / size."""
-    return placed_texels(*covered_texels(faces, uvs, size), vertices, normals)
+    return placed_texels(covered_texels(faces, uvs, size), vertices, normals)
 
 
-def covered_texels(faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int) -> Covered:
-    """Return the texels in charts.
-
-    Texel centers are at (index + 0.5) / size.
-    """
+def covered_texels(faces: Int[Tensor, "f 3"], uvs: Float[Tensor, "v 2"], size: int) -> CoveredTexels:
+    """Return the texels in charts of a square texture."""
     ids, weights = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
     _rasterize_uvs(uvs.double().numpy() * size, faces.to(torch.int32).numpy(), ids, weights)
     found = torch.from_numpy(ids)
     rows, columns = torch.nonzero(found >= 0, as_tuple=True)
-    return rows, columns, faces.long()[found[rows, columns].long()], torch.from_numpy(weights)[rows, columns]
+    corners = faces.long()[found[rows, columns].long()]
+    return CoveredTexels(rows, columns, corners, torch.from_numpy(weights)[rows, columns])
 
 
-def placed_texels(
-    rows: Int[Tensor, " p"],
-    columns: Int[Tensor, " p"],
-    corners: Int[Tensor, "p 3"],
-    shares: Float[Tensor, "p 3"],
-    vertices: Float[Tensor, "v 3"],
-    normals: Float[Tensor, "v 3"],
-) -> Texels:
+def placed_texels(covered: CoveredTexels, vertices: Float[Tensor, "v 3"], normals: Float[Tensor, "v 3"]) -> Texels:
     """Return the texels where the vertices are."""
-    positions, facing = (_interpolated(values, corners, shares) for values in (vertices, normals))
-    return Texels(rows, columns, positions, normalize(facing, dim=-1))
+    positions, facing = (_interpolated(values, covered.corners, covered.shares) for values in (vertices, normals))
+    return Texels(covered.rows, covered.columns, positions, normalize(facing, dim=-1))
 
 
 def _interpolated(
@@ -196,6 +194,33 @@ def _interpolated(
         for corner, share in zip(corners.unbind(1), shares.unbind(1), strict=True)
     )
     return sum(others, first)
+
+
+def add_footage(
+    footage: Sequence[PosedSurface],
+    covered: CoveredTexels,
+    faces: Int[Tensor, "f 3"],
+    side: float,
+    weight: float,
+    total: NDArray[np.float32],
+) -> None:
+    """Add the colors that frames of the driving video show to the sums of texels.
+
+    Args:
+        footage: the surface at these frames.
+        covered: p texels.
+        faces: of the surface.
+        side: pixels of a side of pictures whose unreliable band is `OUTLINE` pixels wide; that of coarser frames is
+            narrower, but not below a pixel.
+        weight: of the frames.
+        total: "p 4", sums of weight * color and of weight; changed.
+    """
+    for posed in footage:
+        camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
+        moved = placed_texels(covered, posed.vertices, posed.normals)
+        reach = max(1, round(OUTLINE * camera.width / side))
+        pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, reach)
+        add_views(moved, [camera], pictures, [(INPUT_MIN_COSINE, weight * posed.weight)], total)
 
 
 def add_views(

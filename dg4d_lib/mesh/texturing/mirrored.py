@@ -3,24 +3,25 @@
 A texel that no frame shows takes the color that the input view shows at its mirror image, where there is a surface.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh.render import render_mesh, smooth_normals
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import (
-    INPUT_FLATTER,
-    MIN_COSINE,
+    INPUT_MIN_COSINE,
     OUTLINE,
-    Covered,
+    CoveredTexels,
     PosedSurface,
     Texels,
+    add_footage,
     add_views,
     covered_texels,
     fill_texture,
@@ -33,7 +34,6 @@ from dg4d_lib.shape_prior.mirror import MirrorPlane
 REACH = 0.12  # world units along a ray of the input camera: a mirror image further from the surface shows nothing
 SHOWN = 10.0  # weight of colors that frames show, relative to that of a mirror image
 GUESSED = 0.01  # weight of other colors; mirror images that are seen at grazing angles give way to them
-FLATTEST = INPUT_FLATTER * MIN_COSINE  # cosine below which a mirror image is not seen
 
 
 def mirror_texture(
@@ -52,34 +52,23 @@ def mirror_texture(
     """
     size = len(mesh.texture)
     covered = covered_texels(mesh.faces, mesh.uvs, size)
-    texels = placed_texels(*covered, mesh.vertices, smooth_normals(mesh))
+    texels = placed_texels(covered, mesh.vertices, smooth_normals(mesh))
     camera = OrbitCamera(width=size, height=size)
     color, alpha = render_mesh(mesh, [camera], supersampling=1)
     view = grade_pixels(color, alpha[..., 0], [camera], mesh.vertices, mesh.faces, OUTLINE)
     images, nearness = _on_surface(_mirrored(texels, plane), camera, view[2][0])
     mirrored = np.zeros((len(nearness), 4), np.float32)
-    add_views(images, [camera], view, [(FLATTEST, 1.0)], mirrored)
+    add_views(images, [camera], view, [(INPUT_MIN_COSINE, 1.0)], mirrored)
     weight = nearness * torch.from_numpy(mirrored[:, 3])
     found = (weight > 0).nonzero()[:, 0]
-    rows, columns, corners, shares = (part[found] for part in covered)
-    shown = _weights_of(footage, (rows, columns, corners, shares), mesh.faces)
-    share = plane.trust * weight[found] / (weight[found] + SHOWN * shown + GUESSED)
+    shown = np.zeros((len(found), 4), np.float32)
+    add_footage(footage, CoveredTexels(*(part[found] for part in covered)), mesh.faces, math.inf, 1.0, shown)
+    share = plane.trust * weight[found] / (weight[found] + SHOWN * torch.from_numpy(shown[:, 3]) + GUESSED)
     colors = mesh.texture[texels.rows, texels.columns]
     taken = torch.from_numpy(mirrored[found, :3] / mirrored[found, 3:])
     colors[found] = torch.lerp(colors[found], taken, share[:, None])
     texture = level_seams(fill_texture(colors, texels, size), seam_points(mesh.vertices, mesh.faces, mesh.uvs, size))
     return texture, int((share > 0.5).sum()) / max(1, len(colors))
-
-
-def _weights_of(footage: Sequence[PosedSurface], covered: Covered, faces: Int[Tensor, "f 3"]) -> Float[Tensor, " p"]:
-    """Return the weights that frames have in some texels, summed over frames; see `covered_texels`."""
-    total = np.zeros((len(covered[0]), 4), np.float32)
-    for posed in footage:
-        camera = OrbitCamera(width=posed.color.shape[1], height=posed.color.shape[0])
-        pictures = grade_pixels(posed.color[None], posed.alpha[None, ..., 0], [camera], posed.vertices, faces, 1)
-        moved = placed_texels(*covered, posed.vertices, posed.normals)
-        add_views(moved, [camera], pictures, [(FLATTEST, posed.weight)], total)
-    return torch.from_numpy(total[:, 3])
 
 
 def _mirrored(texels: Texels, plane: MirrorPlane) -> Texels:

@@ -19,6 +19,7 @@ from tiny_s3 import TinyS3
 from waiting import wait_until
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.input_settings import WarpSettings
 from flows import deployments
 from flows.packages.publish import load_verified
 from flows.serving import registering, watching
@@ -104,7 +105,8 @@ def test_what_a_form_asks_for_reaches_the_knobs() -> None:
     filled = {"triangles": 400, "fps": None, "motion": "wave", "settings": ["mesh.max_faces=7", "subject.size = 64"]}
     options = deployments.PictureOptions.model_validate(filled)
     assert options.changes() == {"mesh.max_faces": 400, "driving.motion": "wave", "subject.size": 64}
-    assert revise(PREVIEW, options.changes()).driving.motion == "wave"  # type: ignore[union-attr]
+    driving = revise(PREVIEW, options.changes()).driving
+    assert isinstance(driving, WarpSettings) and driving.motion == "wave"
 
 
 def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
