@@ -33,10 +33,10 @@ GENERATIVE = (  # steps that generate parts of the asset if they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
-def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> Files:
+def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> None:
     """Put the package of a conversion with reports and record into a folder; see `publish`."""
     store = home.store()
-    return publish(
+    publish(
         store.path(result.package),
         folder,
         lambda staging, files: finish_package(staging, files, job, result, store, signer),
