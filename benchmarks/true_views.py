@@ -21,14 +21,14 @@ from dg4d_lib.images import over_white, resize
 from dg4d_lib.inflation.ground import ground_turn
 from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from dg4d_lib.settings import LearnedPriorSettings, LgmStartSettings
+from dg4d_lib.settings import LgmStartSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.subject import prepare_subject
 from steps.artifacts.ground_truth import GroundTruth, find_ground_truths
 from steps.artifacts.media import read_png
 from steps.artifacts.motions import new_deformation
 from steps.fit_gaussians import initial_gaussians
-from steps.fitting.priors import known_views, make_prior, still_views, subject_shapes
+from steps.fitting.priors import known_views, make_prior, still_views, subject_shapes, usable_turn
 from steps.fitting.tracking import SurfaceTracker, tracks_surface
 from steps.profiles import PipelineSettings
 from steps.score_asset import MetricNetworks, ViewFrames, compare
@@ -76,9 +76,8 @@ def prepared(subject: Subject, settings: PipelineSettings) -> Float[Tensor, "t s
 
 def hint_of(cutouts: Float[Tensor, "t h w 4"], settings: PipelineSettings) -> DepthHint:
     """Return the turn that the pipeline uses for this footage."""
-    learned = isinstance(settings.prior, LearnedPriorSettings)
-    found = 0.0 if learned else ground_turn(cutouts[..., 3:], settings.subject.ground_turn)
-    return DepthHint(settings.subject.turn_deg or found)
+    found = ground_turn(cutouts[..., 3:], settings.subject.ground_turn)
+    return DepthHint(settings.subject.turn_deg or usable_turn(settings.prior, found))
 
 
 def fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None) -> Gaussians:
@@ -91,7 +90,8 @@ def fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None)
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
     cutouts = prepared(subject, settings)
-    hint, start_settings = hint_of(cutouts, settings), settings.static.start
+    hint = DepthHint(settings.subject.turn_deg) if sides else hint_of(cutouts, settings)
+    start_settings = settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
     shapes = subject_shapes(settings.prior, [cutouts[0]], hint, sides)
     start = initial_gaussians(start_settings, shapes, generator)

@@ -133,7 +133,8 @@ def run(job: Job) -> StepReport:
         job.progress(1, stages, {})
         guesses = None
         if settings.source == "prior" and video and "subject" in job.inputs:
-            guesses = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
+            hints = job.inputs.get("pose"), job.inputs.get("depth_field")
+            guesses = guessed_shapes(video, *hints, job.settings.turn_deg)
             weights = packaged.digests()
         rest_shape = partial(_rest_shape, states, plan.level, rasterize, settings, guesses)
         if video and plan.guide == "video":

@@ -36,8 +36,8 @@ def run(job: Job) -> StepReport:
     static: StaticSettings = job.settings.static
     prior: PriorSettings = job.settings.prior
     backend = job.settings.rasterizer
-    depth = job.inputs.get("depth_field")
-    hint = subject_hint(prior, job.inputs.get("pose"), depth, job.settings.turn_deg)
+    pose = job.inputs.get("pose") if "known_views" not in job.inputs else None
+    hint = subject_hint(prior, pose, job.inputs.get("depth_field"), job.settings.turn_deg)
     subject = read_png(job.inputs["subject"])
     generator = torch.Generator().manual_seed(job.seed)
     rasterize = get_rasterizer(backend)

@@ -23,8 +23,8 @@ FRONT_DEG, SIDE_DEG = 0.0, 90.0
 def run(job: Job) -> StepReport:
     """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
     backend, prior = job.settings.rasterizer, job.settings.prior
-    depth = job.inputs.get("depth_field")
-    hint = subject_hint(prior, job.inputs.get("pose"), depth, job.settings.turn_deg)
+    pose = job.inputs.get("pose") if "known_views" not in job.inputs else None
+    hint = subject_hint(prior, pose, job.inputs.get("depth_field"), job.settings.turn_deg)
     kind: DeformationSettings = job.settings.deformation
     settings: MotionSettings = job.settings.motion
     gaussians = read_ply(job.inputs["gaussians"])

@@ -48,7 +48,8 @@ def run(job: Job) -> StepReport:
             generator = torch.Generator().manual_seed(job.seed)
             rank = partial(rank_guided_references, states, video, rasterize, settings, frame, generator)
             if settings.source == "prior" and "subject" in job.inputs:
-                shapes = guessed_shapes(video, job.inputs.get("depth_field"), job.settings.turn_deg)
+                hints = job.inputs.get("pose"), job.inputs.get("depth_field")
+                shapes = guessed_shapes(video, *hints, job.settings.turn_deg)
                 ranked = rank(lambda candidate: genus(shapes.surface(candidate).faces.numpy()))
                 weights = packaged.digests()
             else:

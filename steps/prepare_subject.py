@@ -84,8 +84,9 @@ def turn_note(turn_deg: float) -> str:
     """Return the sentence about a turn that was found."""
     nearer = "right" if turn_deg > 0 else "left"
     return (
-        f"ground line of the footage: the {nearer} side is taken to be nearer, by a turn of {abs(turn_deg):.0f} "
-        "degrees, by the geometric prior; `subject.turn_deg` overrides it, `subject.ground_turn=0` ignores it"
+        f"ground line of the footage: its {nearer} end is nearer, so priors without weights take the subject to be "
+        f"turned by about {abs(turn_deg):.0f} degrees if no other views are given; `subject.turn_deg` overrides it, "
+        "`subject.ground_turn=0` ignores it"
     )
 
 

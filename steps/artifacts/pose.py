@@ -19,14 +19,14 @@ def write_pose(path: Path, pose: Pose) -> None:
     path.write_text(pose.model_dump_json(), encoding="utf-8")
 
 
-def read_turn(path: Path | None, hint_deg: float) -> float:
-    """Return the turn of the subject in degrees: the user's hint, else that of the file, 0 without either.
+def read_turn(path: Path | None) -> float:
+    """Return the turn of the subject that its footage shows, degrees; 0 without a file.
 
     Raises:
         BadInput: the file is no pose.
     """
-    if hint_deg or path is None:
-        return hint_deg
+    if path is None:
+        return 0.0
     try:
         return Pose.model_validate_json(path.read_bytes()).turn_deg
     except ValidationError as error:

@@ -13,16 +13,17 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting.priors import subject_hint, subject_shapes
 
 
-def guessed_shapes(video: DrivingVideo, depth: Path | None, turn_deg: float) -> SubjectShapes:
+def guessed_shapes(video: DrivingVideo, pose: Path | None, depth: Path | None, turn_deg: float) -> SubjectShapes:
     """Return what the shape network says of every frame.
 
     Args:
         video: of the camera at azimuth and elevation 0.
+        pose: turn that the footage shows, if there is footage.
         depth: `depth_field` of the user, if there is one.
         turn_deg: turn of the subject that the user gave, degrees; 0: none.
     """
     prior = LearnedPriorSettings()
-    hint = subject_hint(prior, None, depth, turn_deg)
+    hint = subject_hint(prior, pose, depth, turn_deg)
     return subject_shapes(prior, list(torch.cat([video.frames, video.alpha], -1)), hint)
 
 

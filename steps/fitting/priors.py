@@ -67,6 +67,7 @@ LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the pictur
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
+NETWORK_TRUST = 4 / 3  # of the turn that the inflation takes: the network's own opinion holds against it
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 STABLE_UNET = KNOWN["stable-zero123"].published["unet/diffusion_pytorch_model.safetensors"]  # sha256
 ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
@@ -301,17 +302,22 @@ def known_note(bank: Bank | None, has_predictions: bool) -> str:
 def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None, turn_deg: float) -> DepthHint:
     """Return what is known about the depth of the subject, for a prior.
 
-    The shape network sees turns itself: even true ones from elsewhere do not improve it, so it gets those of the user
-    alone.
-
     Args:
         settings: of the prior.
-        pose: turn that the footage shows.
+        pose: turn that the footage shows; views of other sides make it needless.
         field: depth by the user.
         turn_deg: turn by the user, which goes before that of the footage.
     """
-    shown = None if isinstance(settings, LearnedPriorSettings) else pose
-    return DepthHint(read_turn(shown, turn_deg), read_depth_field(field) if field else None)
+    turn_deg = turn_deg or usable_turn(settings, read_turn(pose))
+    return DepthHint(turn_deg, read_depth_field(field) if field else None)
+
+
+def usable_turn(settings: PriorSettings, shown_deg: float) -> float:
+    """Return the turn that a prior takes where footage shows one, degrees.
+
+    The inflation takes it as it is. For the shape network it is evidence beside what the network sees itself.
+    """
+    return shown_deg * NETWORK_TRUST if isinstance(settings, LearnedPriorSettings) else shown_deg
 
 
 def inflated_note(share: float) -> str:
