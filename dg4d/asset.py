@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from dg4d_lib.errors import BadInput
 from flows.inputs.json_text import loads
-from flows.inputs.package_record import RECORD
+from flows.inputs.package_record import RECORD, record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.publish import check_writable, load_verified
 from flows.packages.view import ASSET, viewer_html, viewer_of_package
@@ -63,6 +63,7 @@ class Asset:
     """Animated 3D asset in a package.
 
     Times are seconds. The animation loops: a time after the end, or before the start, is taken modulo `duration_s`.
+    Files are read when they are needed; if the folder holds another asset by then, that raises BadInput.
 
     Args:
         folder: unpacked package.
@@ -105,7 +106,7 @@ class Asset:
     @cached_property
     def report(self) -> dict[str, Any]:
         """Report of the conversion: steps, times, quality gates, notes; empty for a zip without one."""
-        path = self.folder / REPORT
+        path = self._checked_folder() / REPORT
         if not path.is_file():
             return {}
         try:
@@ -117,7 +118,7 @@ class Asset:
     @property
     def failing(self) -> list[str] | None:
         """Quality gates that the asset fails; None if they were not evaluated."""
-        return failing_gates(self.folder)
+        return failing_gates(self._checked_folder())
 
     def mesh(self, t: float = 0.0) -> "Trimesh":
         """Return the textured mesh at a time, in meters and y up, as in the files of the package."""
@@ -163,12 +164,12 @@ class Asset:
         """Write the animated textured mesh as binary glTF; return the path.
 
         Raises:
-            BadInput: the file cannot be written.
+            BadInput: the file cannot be written, or the folder holds another asset.
         """
-        path = Path(path)
+        path, folder = Path(path), self._checked_folder()
         check_writable(path.parent)
         try:
-            shutil.copyfile(self.folder / ASSET, path)
+            shutil.copyfile(folder / ASSET, path)
         except OSError as error:
             raise BadInput(f"{path} cannot be written: {error.strerror or error}; choose another path") from error
         return path
@@ -181,12 +182,26 @@ class Asset:
         if self._package is not None and "files" not in self._record:
             page = viewer_of_package(self._package, self.name)
         else:
-            page = viewer_html(self._record, lambda name: (self.folder / name).read_bytes())
+            folder = self._checked_folder()
+            page = viewer_html(self._record, lambda name: (folder / name).read_bytes())
         title, content = html.escape(self.name, quote=True), html.escape(page, quote=True)
         return (
             f'<iframe title="{title}" sandbox="allow-scripts allow-downloads" width="100%" height="{FRAME_HEIGHT}" '
             f'style="border:0" srcdoc="{content}"></iframe>'
         )
+
+    def _checked_folder(self) -> Path:
+        """Return the folder.
+
+        Raises:
+            BadInput: the package in it was replaced or removed since the asset was loaded.
+        """
+        if "files" in self._record and (record_of(self.folder) or {}).get("files") != self._record["files"]:
+            raise BadInput(
+                f"the folder {self.folder} now holds another asset, or none, instead of the {self.name!r} that was "
+                "loaded; make each asset in a folder of its own: give out=..."
+            )
+        return self.folder
 
     def _position(self, t: float) -> Any:
         """Return a time as a position in frames, in a tensor."""
@@ -208,13 +223,13 @@ class Asset:
     def _states(self) -> "States":
         from steps.artifacts.rendering import read_states
 
-        return read_states(self.folder, self.manifest)
+        return read_states(self._checked_folder(), self.manifest)
 
     @cached_property
     def _surface(self) -> "Surface":
         from steps.artifacts.rendering import read_surface
 
-        return read_surface(self.folder, self.manifest)
+        return read_surface(self._checked_folder(), self.manifest)
 
     @cached_property
     def _draw_gaussians(self) -> "Renderer":

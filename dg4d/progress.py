@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-from flows.engine.events import StepEvent, listening
+from flows.engine.events import StepEvent, listening_in_context
 from flows.engine.schedule import Schedule, format_left, keep_durations, load_durations
 from flows.inputs.conversion_job import ConversionJob
 from flows.stages import planned_steps
@@ -59,8 +59,6 @@ def reporting(job: ConversionJob, on_progress: OnProgress | None) -> Iterator[No
     raised: list[BaseException] = []
 
     def listen(event: StepEvent) -> None:
-        if event.item != job.item:
-            return
         schedule.note(event)
         if raised and event.kind != "failed":
             raise raised[0]
@@ -71,7 +69,7 @@ def reporting(job: ConversionJob, on_progress: OnProgress | None) -> Iterator[No
                 raised.append(error)
                 raise
 
-    with listening(listen):
+    with listening_in_context(listen):
         yield
     keep_durations(job.profile, schedule.durations())
 

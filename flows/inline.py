@@ -11,19 +11,19 @@ import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 from flows import home
 from flows.convert import convert_job, prepare
 from flows.engine import resources
-from flows.engine.events import StepEvent, emit
 from flows.engine.executors import stop_all
 from flows.engine.file_locks import FileLocks
 from flows.engine.free_space import require_free_space
 from flows.engine.records import read_record, record_key, recorded, write_record
 from flows.engine.requests import in_order, label_of, request_for
-from flows.engine.running import RETRIES, RETRY_DELAY_S, NullObserver, finish_step, may_succeed, observed_by
+from flows.engine.running import RETRIES, RETRY_DELAY_S, NullObserver, fail_step, finish_step, may_succeed, observed_by
 from flows.engine.versions import keep_version
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured_signer
@@ -95,8 +95,9 @@ class _Task(Generic[P, R]):
         self._signature = inspect.signature(call)
 
     def submit(self, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        """Run the task in a thread of the pool."""
-        return self._pool.submit(self, *args, **kwargs)
+        """Run the task in a thread of the pool, in a copy of the current context."""
+        context = copy_context()
+        return self._pool.submit(lambda: context.run(self, *args, **kwargs))
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run the task, or take the recorded result of an equal one, and note the run."""
@@ -112,8 +113,8 @@ class _Task(Generic[P, R]):
 
         try:
             result, cached = _cached(request_for(step, bound.arguments), compute)
-        except BaseException:
-            emit(StepEvent(item, label, "failed", seconds=time.monotonic() - start))
+        except BaseException as error:
+            fail_step(item, label, time.monotonic() - start, isinstance(error, KeyboardInterrupt))
             raise
         seconds = time.monotonic() - start
         self._runs.append(finish_step(item, label, result, cached, seconds, observer.waited_s))

@@ -1,5 +1,7 @@
 """Exceptions of failed steps."""
 
+from typing import Any
+
 from steps.contract import ArtifactRef
 
 
@@ -15,6 +17,10 @@ class StepError(Exception):
     def __init__(self, step: str, message: str, pictures: dict[str, ArtifactRef] | None = None) -> None:
         super().__init__(f"{step}: {message}")
         self.step, self.message, self.pictures = step, message, pictures or {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the arguments of `__init__`; `args` holds one string."""
+        return type(self), (self.step, self.message, self.pictures)
 
 
 class StepBadInput(StepError):

@@ -16,6 +16,7 @@ import torch
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D, pose_gaussians
 from dg4d_lib.assets.formats.compact import CompactAsset, write_compact
+from dg4d_lib.assets.formats.foreign_placement import place_moving_glb
 from dg4d_lib.assets.formats.glb import component_notes, write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.assets.formats.rigged import PRECISE, fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
@@ -102,19 +103,28 @@ class PackageWriter:
 
     def write_meshes(self) -> Sequence[str]:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
-        gltf, surface = self.pack.gltf, self.surface
+        gltf, surface, notes = self.pack.gltf, self.surface, tuple[str, ...]()
         if isinstance(surface, Asset4D):
             name = packages.ASSET
             if "moving" in self.inputs:
-                shutil.copyfile(self.inputs["moving"], self.path(name))
+                notes = self._write_model(name)
                 name = packages.MERGED
             content = write_glb(surface, gltf)
             self.path(name).write_bytes(content)
-            return component_notes(name, content)
+            return notes + component_notes(name, content)
         self.path(packages.ASSET).write_bytes(write_frames_glb(surface, self.fps, _extras(self.notes), gltf))
         for frame, mesh in enumerate(surface):
             self.path(f"{packages.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
         return ()
+
+    def _write_model(self, name: str) -> tuple[str, ...]:
+        """Write the user's model in motion, placed; it keeps its keys and lasts as long as the other files."""
+        slowdown = len(self.states.means) / self.fps / (len(self.video) / self.video.fps)
+        content = place_moving_glb(self.inputs["moving"].read_bytes(), self.placement, slowdown)
+        self.path(name).write_bytes(content)
+        if self.fps == self.video.fps:
+            return ()
+        return (f"{name} keeps the keys of the driving video, {self.video.fps:.4g} per second, not {self.fps:.4g}",)
 
     def write_levels(self) -> Sequence[str]:
         """Write the tracked mesh with fewer triangles."""

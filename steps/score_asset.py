@@ -1,6 +1,7 @@
 """Step that compares an asset, or naive baselines without an asset, with ground truth."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,12 +28,14 @@ from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.metrics.video import flicker, motion_amount, temporal_error
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import GroundTruth, find_ground_truth
-from steps.artifacts.media import read_png, write_zip
+from steps.artifacts.media import write_zip
 from steps.artifacts.rendering import render_package
 from steps.artifacts.surface_scores import actionbench_scores, chamfer_scores, read_true_meshes
 from steps.profiles import ScoreAssetSettings
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
+from steps.sources.decode_limit import DecodeLimit
+from steps.sources.stills import MOST_PIXELS, StillPicture, read_still
 
 FOREGROUND = 0.5  # alpha from which a pixel belongs to the subject
 NEARLY_WHITE = 0.98  # in opaque pictures, the subject has a channel below this
@@ -222,7 +225,7 @@ def _report(
     """Return the `scores` artifact; `clips` are I3D's logits by view."""
     frames = len(truth.views[0].frames) if truth.views else len(truth.inputs)
     first = (truth.inputs[0], *(view.frames[0] for view in truth.views))
-    opaque = [path.parent.name for path in first if read_png(path).shape[-1] != 4]
+    opaque = [path.parent.name for path in first if not _decode(path).has_alpha]
     notes = [f"masks of the truth are guessed, its pictures are opaque: {', '.join(opaque)}"] if opaque else []
     features = {name: clip.tolist() for name, clip in clips.items() if clip is not None}
     return {"frames": frames, "size": size, "rows": dict(rows), "clips": features, "notes": notes}
@@ -246,24 +249,28 @@ def _geometry(package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int
 
 
 def _read(frames: Sequence[Path], size: int | None = None) -> ViewFrames:
-    """Read frames over white, all of one square size."""
-    pictures = [read_png(path) for path in frames]
-    shapes = {(picture.shape[0], picture.shape[1]) for picture in pictures}
+    """Read frames over white, all of one square size: the first one's if `size` is None."""
+    cutouts = [_cutout(_decode(path)) for path in frames]
+    shapes = {(cutout.shape[0], cutout.shape[1]) for cutout in cutouts}
     if len(shapes) > 1 or any(height != width or height != (size or height) for height, width in shapes):
+        wanted = "square and of one size" if size is None else f"{size} x {size}, as those of the input"
         found = ", ".join(f"{width} x {height}" for height, width in sorted(shapes))
-        raise BadInput(
-            f"the frames of {frames[0].parent.name} must be square and as large as the input's; found {found}"
-        )
-    cutouts = torch.stack([_cutout(picture) for picture in pictures])
-    alpha = cutouts[..., 3:]
-    return ViewFrames(over_background(cutouts[..., :3], alpha, 1.0), alpha)
+        raise BadInput(f"the frames of {frames[0].parent.name} must be {wanted}; found {found}")
+    pictures = torch.stack(cutouts)
+    alpha = pictures[..., 3:]
+    return ViewFrames(over_background(pictures[..., :3], alpha, 1.0), alpha)
 
 
-def _cutout(picture: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 4"]:
+def _decode(path: Path) -> StillPicture:
+    """Decode a frame as pictures that assets are made from, upright, but never shrunk."""
+    return read_still(path, f"{path.parent.name}/{path.name}", DecodeLimit(math.inf), MOST_PIXELS)
+
+
+def _cutout(picture: StillPicture) -> Float[Tensor, "h w 4"]:
     """Return a picture with alpha; in an opaque one, everything but white is the subject."""
-    if picture.shape[-1] == 4:
-        return picture
-    color = picture[..., :3].expand(-1, -1, 3)  # one channel is gray
+    if picture.has_alpha:
+        return picture.pixels
+    color = picture.pixels[..., :3]
     return torch.cat([color, (color.amin(-1, keepdim=True) < NEARLY_WHITE).to(color)], -1)
 
 

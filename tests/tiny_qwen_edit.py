@@ -1,4 +1,4 @@
-"""A tiny random Qwen-Image-Edit and a LoRA for it, saved in the layout of the real ones."""
+"""A tiny random Qwen-Image-Edit, a LoRA for it, and a Qwen-Image, saved in the layout of the real ones."""
 
 import json
 from pathlib import Path
@@ -80,6 +80,16 @@ def save_tiny_qwen_edit(folder: Path) -> Path:
     index = json.loads((folder / "model_index.json").read_text())
     (folder / "model_index.json").write_text(json.dumps({**index, "processor": ["transformers", "Qwen2VLProcessor"]}))
     return folder
+
+
+def save_tiny_qwen_image(folder: Path) -> Path:
+    """A QwenImagePipeline, for text alone, of the same networks."""
+    from diffusers import QwenImageEditPlusPipeline, QwenImagePipeline
+
+    edit = QwenImageEditPlusPipeline.from_pretrained(save_tiny_qwen_edit(folder / "edit"), processor=None)
+    parts = {name: part for name, part in edit.components.items() if name != "processor"}
+    QwenImagePipeline(**parts).save_pretrained(folder / "image")
+    return folder / "image"
 
 
 def save_tiny_lora(folder: Path, prefix: str = "transformer.", scale: float = 1.0) -> Path:

@@ -9,6 +9,7 @@
 No code of a folder is executed: classes come from diffusers and transformers, tensors from the files.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -118,13 +119,26 @@ def load_component(cls: Any, folder: Path, placement: Placement, names: tuple[st
         )
     except UNREADABLE as error:
         raise BadInput(f"{file} cannot be read: {_first_line(error)}") from error
+    require_all_tensors(file, info)
+    return attach_flop_counter(frozen(component, placement))
+
+
+def require_all_tensors(source: Path, info: Mapping[str, Any]) -> None:
+    """Refuse weights that are incomplete.
+
+    Args:
+        source: file or folder, for the message.
+        info: of `from_pretrained` of diffusers or transformers with `output_loading_info`.
+
+    Raises:
+        BadInput: tensors are missing or of another shape.
+    """
     missing = sorted(map(str, info["missing_keys"])) + sorted(map(str, info["mismatched_keys"]))
     if missing:
         raise BadInput(
-            f"{file} does not match its config.json: {len(missing)} tensors are missing or of another shape, "
+            f"{source} does not match its config.json: {len(missing)} tensors are missing or of another shape, "
             f"the first is {missing[0]}"
         )
-    return attach_flop_counter(frozen(component, placement))
 
 
 def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half: bool = False) -> Path:

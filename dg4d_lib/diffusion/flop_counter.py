@@ -3,6 +3,7 @@
 torch is imported with the first network, because `count_flops` is entered earlier (`steps/runtime/perform.py`).
 """
 
+import inspect
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -31,12 +32,21 @@ def attach_flop_counter(network: Any) -> Any:
     """Make `count_flops` count the calls of a network, and return the network.
 
     A VAE is never called as a whole, so its encoder and decoder are counted under its name. If an input requires a
-    gradient, the backward pass is counted too: with frozen weights it costs as much as the forward pass.
+    gradient, the backward pass is counted too: with frozen weights it costs as much as the forward pass. VAEs that
+    pass a cache from chunk to chunk are not counted, because the counter calls a network twice.
     """
+    if _keeps_state(network):
+        return network
     name = type(network).__name__
     for part in (network.encoder, network.decoder) if hasattr(network, "encode") else (network,):
         part.forward = _counting(name, part.forward)
     return network
+
+
+def _keeps_state(network: Any) -> bool:
+    """Return True for VAEs with a cache of features between calls."""
+    parts = (getattr(network, name, None) for name in ("encoder", "decoder"))
+    return any("feat_cache" in inspect.signature(part.forward).parameters for part in parts if part is not None)
 
 
 def _counting(name: str, forward: Callable[..., Any]) -> Callable[..., Any]:

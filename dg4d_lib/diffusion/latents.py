@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 
 SIZE, LATENT_SIZE, LATENT_CHANNELS = 256, 32, 4  # pixels and latents per side, of Zero-1-to-3 and ImageDream
@@ -23,7 +24,17 @@ def decode_images(vae: Any, latents: Float[Tensor, "b c i j"], dtype: torch.dtyp
 
 
 def to_images(planes: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h w 3"]:
-    """Convert the VAE's range [-1, 1], channels first, to images in [0, 1], channels last."""
+    """Convert the VAE's range [-1, 1], channels first, to images in [0, 1], channels last.
+
+    Raises:
+        BadInput: values are not finite.
+    """
+    if not planes.isfinite().all():
+        raise BadInput(
+            "the diffusion model overflowed: its images are not finite; set its precision to bf16 or fp32 "
+            "(--set driving.model.precision=bf16 for a driving video; refiner.model.precision or "
+            "refiner.prior.precision for textures; static.start.precision for the views of LGM)"
+        )
     return (planes.movedim(1, -1) / 2 + 0.5).clamp(0, 1)
 
 

@@ -1,11 +1,15 @@
 """LoRA adapters, merged into the weights of a network: W + scale * (alpha / rank) * up @ down (Hu et al. 2021)."""
 
+import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from pydantic import BaseModel, ConfigDict, FiniteFloat
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from dg4d_lib.diffusion.components import read_tensors
@@ -20,11 +24,26 @@ FACTOR = re.compile(
 
 
 class _Factors(NamedTuple):
-    """Low-rank factors of one layer, and the scale that its file gives."""
+    """Low-rank factors of one layer, and the scale of their product: alpha / rank."""
 
     down: Tensor
     up: Tensor
-    alpha: float | None
+    scaling: float
+
+
+class _Adapter(BaseModel):
+    """Settings of PEFT in the metadata of a file, as `save_lora_weights` of diffusers writes them.
+
+    Attributes:
+        lora_alpha: of all layers; None: equal to their rank.
+        alpha_pattern: alpha of single layers, by a pattern of the end of their names.
+        use_rslora: divide alpha by the square root of the rank.
+    """
+
+    model_config = ConfigDict(frozen=True)
+    lora_alpha: FiniteFloat | None = None
+    alpha_pattern: dict[re.Pattern[str], FiniteFloat] = {}
+    use_rslora: bool = False
 
 
 def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
@@ -48,10 +67,8 @@ def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
         expected = layer.out_features, layer.in_features
         if (one.up.shape[0], one.down.shape[1]) != expected or one.up.shape[1] != one.down.shape[0]:
             raise BadInput(f"{file} belongs to another network: {name} has {expected[0]} x {expected[1]} weights")
-        rank = one.down.shape[0]
-        factor = scale * (one.alpha / rank if one.alpha is not None else 1.0)
         with torch.no_grad():
-            added = factor * (one.up.float() @ one.down.float())
+            added = scale * one.scaling * (one.up.float() @ one.down.float())
             layer.weight.copy_((layer.weight.float() + added.to(layer.weight.device)).to(layer.weight.dtype))
     return len(factors)
 
@@ -79,7 +96,11 @@ def _read_factors(file: Path) -> dict[str, _Factors]:
             (down if found["factor"] in DOWN else up)[found["layer"]] = tensor
     if not down or set(down) != set(up) or any(one.ndim != 2 for one in (*down.values(), *up.values())):
         raise BadInput(f"{file} is no LoRA of linear layers; give one that was made for this network")
-    return {_layer_name(name): _Factors(down[name], up[name], _alpha(tensors, name)) for name in down}
+    adapter = _read_adapter(file)
+    return {
+        _layer_name(name): _Factors(down[name], up[name], _scaling(tensors, adapter, name, down[name].shape[0]))
+        for name in down
+    }
 
 
 def _layer_name(name: str) -> str:
@@ -89,6 +110,24 @@ def _layer_name(name: str) -> str:
     return name
 
 
-def _alpha(tensors: Mapping[str, Tensor], name: str) -> float | None:
-    alpha = tensors.get(f"{name}.alpha")
-    return float(alpha) if alpha is not None else None
+def _read_adapter(file: Path) -> _Adapter:
+    if file.suffix != ".safetensors":
+        return _Adapter()
+    with safe_open(file, "pt") as opened:
+        stored = (opened.metadata() or {}).get("lora_adapter_metadata", "{}")
+    try:
+        return _Adapter.model_validate({_layer_name(key): value for key, value in json.loads(stored).items()})
+    except (ValueError, AttributeError) as error:
+        raise BadInput(
+            f"lora_adapter_metadata in {file} cannot be read; save the LoRA again with save_lora_weights of diffusers"
+        ) from error
+
+
+def _scaling(tensors: Mapping[str, Tensor], adapter: _Adapter, name: str, rank: int) -> float:
+    """Return alpha / rank of a layer: from its tensor of alpha, else from the settings of PEFT, else 1."""
+    if (alpha := tensors.get(f"{name}.alpha")) is not None:
+        return float(alpha) / rank
+    layer = _layer_name(name)
+    own = (given for end, given in adapter.alpha_pattern.items() if re.fullmatch(rf"(.*\.)?({end.pattern})", layer))
+    given = next(own, adapter.lora_alpha)
+    return 1.0 if given is None else given / (math.sqrt(rank) if adapter.use_rslora else rank)

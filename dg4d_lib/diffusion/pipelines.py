@@ -7,6 +7,7 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -14,11 +15,12 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from dg4d_lib.diffusion.components import HALF, missing_packages
+from dg4d_lib.diffusion.components import HALF, missing_packages, require_all_tensors
 from dg4d_lib.diffusion.flop_counter import attach_flop_counter
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
 INDEX = "model_index.json"
+NEGATIVE = " "  # as the card of Qwen-Image: true_cfg_scale needs some negative prompt
 GIB = 2**30  # bytes
 WORKSPACE_GB = 1.5  # GiB: CUDA context, latents and activations of 512 x 512 pixels; a plan, not measured on a GPU
 
@@ -51,7 +53,7 @@ def load_pipeline(model: Path, dtype: torch.dtype, class_name: str = "", **parts
         parts: components that replace those of the folder.
 
     Raises:
-        BadInput: there is no pipeline, or it cannot be read.
+        BadInput: there is no pipeline, it cannot be read, or tensors are missing.
         BackendUnavailable: diffusers or a package that the pipeline needs is not installed.
     """
     try:
@@ -62,13 +64,17 @@ def load_pipeline(model: Path, dtype: torch.dtype, class_name: str = "", **parts
     cls = getattr(diffusers, class_name, None) if class_name else diffusers.DiffusionPipeline
     if cls is None:
         raise BadInput(f"diffusers {diffusers.__version__} has no {class_name}, which {named} in {model} needs")
-    half = any(model.glob(f"*/*.{HALF}*"))
     try:
+        taken = inspect.signature(cls).parameters
+        networks = _load_networks(model, dtype, lambda name: name not in parts and (not class_name or name in taken))
+        half = any(_variant(folder, dtype) for folder in model.iterdir())
         pipeline = cls.from_pretrained(
-            model, dtype=dtype, variant=HALF if half else None, local_files_only=True, **parts
+            model, dtype=dtype, variant=HALF if half else None, local_files_only=True, **networks, **parts
         )
     except ImportError as error:
         raise BackendUnavailable(f"the pipeline in {model} needs a package that is not installed: {error}") from error
+    except BadInput:
+        raise
     except Exception as error:  # every class and file format raises its own types
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadInput(f"the pipeline in {model} cannot be read: {reason}") from error
@@ -82,8 +88,7 @@ def place_pipeline(pipeline: Any, device: torch.device, memory_gb: float) -> Off
     networks = networks_of(pipeline)
     for network in networks.values():
         network.eval().requires_grad_(False)
-        if not keeps_state(network):
-            attach_flop_counter(network)
+        attach_flop_counter(network)
     if device.type == "cpu":
         pipeline.to(device)
         return "none"
@@ -97,12 +102,6 @@ def place_pipeline(pipeline: Any, device: torch.device, memory_gb: float) -> Off
     if offload != "none" and hasattr(getattr(pipeline, "vae", None), "enable_tiling"):
         pipeline.vae.enable_tiling()
     return offload
-
-
-def keeps_state(network: nn.Module) -> bool:
-    """Return True for VAEs that pass a cache from chunk to chunk: counting would call them twice."""
-    parts = (getattr(network, name, None) for name in ("encoder", "decoder"))
-    return any("feat_cache" in inspect.signature(part.forward).parameters for part in parts if part is not None)
 
 
 def choose_offload(sizes: Mapping[str, int], memory_gb: float) -> Offload:
@@ -138,6 +137,20 @@ def bytes_of(network: nn.Module) -> int:
 def call_parameters(pipeline: Any) -> Mapping[str, inspect.Parameter]:
     """Return the parameters that a call of the pipeline takes."""
     return inspect.signature(pipeline.__call__).parameters
+
+
+def guidance_arguments(pipeline: Any, scale: float) -> dict[str, Any]:
+    """Return the arguments of a call that set the scale of classifier-free guidance.
+
+    Pipelines with `true_cfg_scale` ignore `guidance_scale` unless their network is guidance-distilled. Where its
+    default is 1 (FLUX), the models are meant to be sampled without it.
+    """
+    true_scale = call_parameters(pipeline).get("true_cfg_scale")
+    configs = (getattr(part, "config", None) for part in networks_of(pipeline).values())
+    distilled = any(getattr(config, "guidance_embeds", False) for config in configs)
+    if true_scale is None or true_scale.default <= 1 or distilled:
+        return {"guidance_scale": scale}
+    return {"true_cfg_scale": scale, "negative_prompt": NEGATIVE}
 
 
 def call_pipeline(pipeline: Any, model: Path, arguments: Mapping[str, Any]) -> Any:
@@ -178,6 +191,44 @@ def after_step(total: int, progress: Callable[[int, int], None], done: int = 0) 
         return tensors
 
     return report
+
+
+def _load_networks(model: Path, dtype: torch.dtype, wanted: Callable[[str], bool]) -> dict[str, nn.Module]:
+    """Load the networks of model_index.json whose classes belong to diffusers or transformers.
+
+    `DiffusionPipeline.from_pretrained` does not say which tensors are missing, and fills them with random numbers.
+
+    Args:
+        model: folder of the pipeline.
+        dtype: of the networks.
+        wanted: True for the names of the components to load.
+
+    Raises:
+        BadInput: tensors are missing.
+    """
+    networks = {}
+    for name, entry in json.loads((model / INDEX).read_text(encoding="utf-8")).items():
+        match entry:
+            case ["diffusers" | "transformers" as library, str(class_name)] if wanted(name):
+                cls = getattr(import_module(library), class_name, None)
+                if isinstance(cls, type) and issubclass(cls, nn.Module):
+                    folder = model / name
+                    networks[name], info = cls.from_pretrained(  # type: ignore[attr-defined]  # of both libraries
+                        folder,
+                        dtype=dtype,
+                        variant=_variant(folder, dtype),
+                        local_files_only=True,
+                        output_loading_info=True,
+                    )
+                    require_all_tensors(folder, info)
+    return networks
+
+
+def _variant(folder: Path, dtype: torch.dtype) -> str | None:
+    """Return the variant of the files to read: half precision if it is requested or if there is no other."""
+    files = [*folder.glob("*.safetensors"), *folder.glob("*.bin")]
+    variants = {file.name.split(".")[1].split("-")[0] for file in files}  # NAME.fp16-00001-of-00002.safetensors
+    return HALF if HALF in variants and (dtype == torch.float16 or not variants & {"safetensors", "bin"}) else None
 
 
 def _clean_prompts_without_ftfy(pipeline: Any) -> None:

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from dg4d_lib.diffusion.components import compute_dtype
 from dg4d_lib.diffusion.flop_counter import attach_flop_counter
-from dg4d_lib.diffusion.pipelines import after_step, call_parameters, load_pipeline, networks_of
+from dg4d_lib.diffusion.pipelines import (
+    after_step,
+    call_parameters,
+    call_pipeline,
+    guidance_arguments,
+    load_pipeline,
+    networks_of,
+)
 from dg4d_lib.errors import BadInput
 from dg4d_lib.input_settings import TextSettings
 
@@ -37,7 +44,7 @@ def draw_picture(
         sRGB in [0, 1], on the CPU.
 
     Raises:
-        BadInput: the folder holds no such pipeline, or the pipeline returned no valid image.
+        BadInput: the folder holds no such pipeline, or it refused a setting or returned no valid image.
         BackendUnavailable: diffusers or transformers is not installed.
     """
     pipeline = _load(model, compute_dtype(device, settings.precision))
@@ -47,17 +54,17 @@ def draw_picture(
         pipeline.enable_model_cpu_offload(device=device)
     else:
         pipeline.to(device)
-    options = {
+    arguments = {
+        "prompt": text + settings.suffix,
         "num_inference_steps": settings.num_inference_steps,
-        "guidance_scale": settings.guidance_scale,
+        **guidance_arguments(pipeline, settings.guidance_scale),
         "height": settings.size,
         "width": settings.size,
         "generator": generator,
         "output_type": "np",
         "callback_on_step_end": after_step(settings.num_inference_steps, progress),
     }
-    known = call_parameters(pipeline)
-    result = pipeline(text + settings.suffix, **{name: value for name, value in options.items() if name in known})
+    result = call_pipeline(pipeline, model, arguments)
     if any(getattr(result, "nsfw_content_detected", None) or ()):
         raise BadInput(f"the safety checker of {model} blanked the image; change the prompt or the seed")
     image = torch.from_numpy(result.images[0]).float()

@@ -16,6 +16,7 @@ from dg4d_lib.diffusion.pipelines import (
     after_step,
     call_parameters,
     call_pipeline,
+    guidance_arguments,
     load_pipeline,
     place_pipeline,
 )
@@ -34,7 +35,6 @@ AZIMUTH_WORDS = {
 }  # vocabulary of the LoRA
 ELEVATION_WORDS = {-30: "low-angle shot", 0: "eye-level shot", 30: "elevated shot", 60: "high-angle shot"}
 TRIGGER, DISTANCE_WORDS = "<sks>", "medium shot"
-NEGATIVE = " "  # as the model's card: guidance needs some negative prompt
 
 
 class DrawnDirection(NamedTuple):
@@ -107,11 +107,10 @@ class ViewDrawer:
             values = {
                 "image": given,
                 "prompt": direction.prompt(settings.suffix),
-                "negative_prompt": NEGATIVE,
                 "height": settings.size,
                 "width": settings.size,
                 "num_inference_steps": settings.num_inference_steps,
-                "true_cfg_scale": settings.guidance_scale,
+                **guidance_arguments(self.pipeline, settings.guidance_scale),
                 "generator": torch.Generator().manual_seed(seed),
                 "output_type": "np",
                 "callback_on_step_end": after_step(total, progress, number * settings.num_inference_steps),

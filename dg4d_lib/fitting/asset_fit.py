@@ -21,7 +21,7 @@ from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, pyramid_
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
 from dg4d_lib.fitting.node_pose import CONTINUED, Pose
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.geometry.quaternion import quat_multiply, rotate
 from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import BLUR, Rasterizer, Rendering
@@ -207,10 +207,10 @@ class AssetFit:
 
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
-        matrices = self.graph.at_ends(quat_to_rotmat(motion.quats).flatten(2))
+        matrices = self.graph.at_ends(motion.matrices.flatten(2))
         first, second = self.graph.at_ends(motion.shifts)
         moved = self.spans + second - first
-        turned = [(matrix.unflatten(-1, (3, 3)) @ self.spans[..., None])[..., 0] for matrix in matrices]
+        turned = [rotate(matrix.unflatten(-1, (3, 3)), self.spans) for matrix in matrices]
         stretch = torch.cat([(moved - span) / self.graph.lengths[:, None] for span in turned], 1)
         bend = matrices[0] - matrices[1]
         log = self.settings.rigidity_loss == "log"

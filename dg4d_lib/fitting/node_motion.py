@@ -7,6 +7,7 @@ and shifts are added: a step that turns a shoulder swings the arm, where along s
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.fitting.node_pose import CONTINUED, Pose
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
@@ -47,16 +48,19 @@ class NodeMotion:
 
     def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
         """Return the motion of some frames."""
-        return NodeMotion(**{name: value[frames] for name, value in vars(self).items()})
+        return NodeMotion(self.quats[frames], self.shifts[frames], self.whole_quats[frames], self.whole_shifts[frames])
+
+    @cached_property
+    def matrices(self) -> Float[Tensor, "t m 3 3"]:
+        """Rotations of the nodes."""
+        return quat_to_rotmat(self.quats)
 
     def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
         """Return the points that the nodes of `graph` move, at every frame."""
-        matrices = quat_to_rotmat(self.quats)  # t m 3 3
-        origins = graph.nodes + self.shifts - (matrices @ graph.nodes[..., None])[..., 0]  # x -> R x + origin
-        affine = torch.cat([matrices, origins[..., None]], -1).flatten(2)  # t m 12
+        origins = graph.nodes + self.shifts - rotate(self.matrices, graph.nodes)  # x -> R x + origin
+        affine = torch.cat([self.matrices, origins[..., None]], -1).flatten(2)  # t m 12
         blended = graph.blend(affine).unflatten(-1, (3, 4))
-        moved = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
-        return self._placed(moved, graph)
+        return self._placed(rotate(blended[..., :3], rest) + blended[..., 3], graph)
 
     def nodes(self, graph: ControlGraph) -> Float[Tensor, "t m 3"]:
         """Return the nodes at every frame."""
@@ -96,7 +100,7 @@ class NodeBasis:
             return torch.zeros_like(quats[..., 1:])
         first, second = self._graph.at_ends(quat_to_rotmat(quats).flatten(2))
         turns = (0.5 * (first + second)).unflatten(-1, (3, 3))
-        return self._integral @ (turns @ self._spans[..., None])[..., 0] - self._centered
+        return self._integral @ rotate(turns, self._spans) - self._centered
 
 
 @dataclass(frozen=True)

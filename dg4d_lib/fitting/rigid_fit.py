@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dg4d_lib.fitting.asset_fit import AssetFit, robust
 from dg4d_lib.fitting.rigid_parts import RigidMotion
-from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.geometry.quaternion import rotate
 
 ITERATIONS = 24  # at most
 SHIFT, SHIFT_IN_DEPTH, TURN = 0.001, 0.0025, 0.002  # forward differences, world units; turns at the radius of a part
@@ -109,9 +109,9 @@ class _Problem:
         seen = self.fit.residuals(moved, list(range(frames.start, frames.stop)))
         edges, settings = self.graph.edges[self.joints], self.fit.settings
         spans, lengths = self.graph.spans[self.joints], self.graph.lengths[self.joints, None]
-        nodes, turns = moved.nodes(self.graph), quat_to_rotmat(moved.quats)
+        nodes, turns = moved.nodes(self.graph), moved.matrices
         gaps = nodes[:, edges[:, 1]] - nodes[:, edges[:, 0]]
-        turned = [(turns[:, edges[:, end]] @ spans[..., None])[..., 0] for end in (0, 1)]
+        turned = [rotate(turns[:, edges[:, end]], spans) for end in (0, 1)]
         stretch = torch.cat([(gaps - one) / lengths for one in turned], 1)
         size = stretch.norm(dim=-1, keepdim=True).clamp(min=1e-9)
         loss = robust(stretch, settings.rigidity_loss == "log").clamp(min=0)[..., None]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 UNEXPLAINED = 0.15  # of the displacements of the points, root mean square, that rigid parts may leave
@@ -51,7 +51,7 @@ class RigidMotion:
         """Return the motion of the nodes that the parts consist of."""
         quats = self.quats[:, self.parts]
         spans = graph.nodes - self.centers[self.parts]
-        moved = (quat_to_rotmat(quats) @ spans[..., None])[..., 0] + self.places[:, self.parts]
+        moved = rotate(quat_to_rotmat(quats), spans) + self.places[:, self.parts]
         still = quats.new_tensor([1.0, 0, 0, 0]).repeat(len(quats), 1)
         return NodeMotion(quats, moved - graph.nodes, still, torch.zeros_like(still[:, 1:]))
 

@@ -23,7 +23,7 @@ from dg4d_lib.fitting.losses import check_finite
 from dg4d_lib.fitting.node_motion import Descent, NodeMotion
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.mirror import mirror_normal
-from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat
+from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.skeleton import JointGraph
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
@@ -121,7 +121,7 @@ class JointChains:
         places = (self.nodes[0] + torch.cat([variables.whole_shift, variables.whole_depth], -1))[:, None]
         for chosen, picked in self.levels:
             above = picked @ quats
-            spans = (quat_to_rotmat(above) @ self.spans[chosen][..., None])[..., 0]
+            spans = rotate(quat_to_rotmat(above), self.spans[chosen])
             places = torch.cat([places, picked @ places + spans], 1)
             quats = torch.cat([quats, quat_multiply(above, local[:, chosen])], 1)
         still = quats.new_tensor((1.0, 0, 0, 0)).expand(len(quats), 4)

@@ -97,7 +97,8 @@ def distill_in_pieces(
 
     The gradient of an image depends on no other image, so each micro-batch is encoded, scored and differentiated at
     once. Memory holds the encoder's activations of one micro-batch only, and no forward pass is repeated (gradient
-    checkpointing would repeat a third of the work). The backward pass returns the stored gradient.
+    checkpointing would repeat a third of the work). The backward pass returns the stored gradient. The loss is NaN if
+    no predicted noise is finite, so that the fit stops: `distillation_loss` alone would be 0.
 
     Args:
         images: renders in [0, 1]; loss and gradient are on their device.
@@ -108,17 +109,25 @@ def distill_in_pieces(
         batches: micro-batches of images.
     """
 
-    def differentiate(piece: slice) -> tuple[Tensor, Tensor]:
+    def differentiate(piece: slice) -> tuple[Tensor, Tensor, Tensor]:
+        predictions = []
+
+        def predict(noisy: Float[Tensor, "p c u v"], timestep: int) -> Float[Tensor, "p c u v"]:
+            predictions.append(predict_noise(noisy, timestep, piece))
+            return predictions[0]
+
         pixels = images[piece].detach().requires_grad_()
         with torch.enable_grad():
             latents = encode(pixels)
             noises = noise[piece].to(latents.device)
-            mean = distillation_loss(latents, lambda noisy, t: predict_noise(noisy, t, piece), timestep, noises)
+            mean = distillation_loss(latents, predict, timestep, noises)
             loss = mean * len(pixels)  # divided at the end, so that half precision loses no digits
-        return loss.detach().to(images.device), torch.autograd.grad(loss, pixels)[0]
+        usable = predictions[0].isfinite().any().to(images.device)
+        return loss.detach().to(images.device), torch.autograd.grad(loss, pixels)[0], usable
 
-    losses, gradients = zip(*batches.run(differentiate, len(images)), strict=True)
-    return _Differentiated.apply(images, torch.stack(losses).sum() / len(images), torch.cat(gradients) / len(images))
+    losses, gradients, usable = zip(*batches.run(differentiate, len(images)), strict=True)
+    loss = torch.where(torch.stack(usable).any(), torch.stack(losses).sum(), torch.nan)
+    return _Differentiated.apply(images, loss / len(images), torch.cat(gradients) / len(images))
 
 
 class _Differentiated(torch.autograd.Function):

@@ -128,11 +128,20 @@ class ImageDream:
         Args:
             images: of the front of every object, over white, in [0, 1], square.
             prompt: of all of them; may be empty.
+
+        Raises:
+            BackendUnavailable: a single image does not fit into memory.
         """
-        pixels = clip_pixels(images).to(self.image_encoder.device, self.image_encoder.dtype)
-        image_embeds = self.image_encoder(pixels, output_hidden_states=True).hidden_states[-2]
+
+        def embed(piece: slice) -> tuple[Tensor, Tensor]:
+            pixels = clip_pixels(images[piece]).to(self.image_encoder.device, self.image_encoder.dtype)
+            features = self.image_encoder(pixels, output_hidden_states=True).hidden_states[-2]
+            return features, self.encode(images[piece])
+
+        batches = MicroBatches("frames for ImageDream", RING)  # a ring of renders has to fit anyway
+        image_embeds, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(images)), strict=True))
         positive, negative = (self._encode_prompt(text).expand(len(images), -1, -1) for text in (prompt, ""))
-        return ImageDreamCondition(positive, negative, image_embeds, self.encode(images))
+        return ImageDreamCondition(positive, negative, image_embeds, latents)
 
     @torch.no_grad()
     def views(

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path, PurePath
+from typing import Any
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.weights.lock import LockEntry, read_lock, write_json
@@ -16,6 +17,7 @@ TENSOR_SUFFIXES = frozenset([".safetensors", ".bin", ".pth", ".pt", ".onnx"])
 READABLE_SUFFIXES = TENSOR_SUFFIXES | {".json", ".txt", ".model"}  # files that loading may read
 NO_TENSORS = f"has no tensors ({', '.join(sorted(TENSOR_SUFFIXES))})"
 DIGEST_CACHE = "digests.json"  # sha256 of large files, so that they are hashed once and not at every run
+PARTIAL = ".cache/huggingface/download"  # in the folder of a download: the hub's client keeps unfinished files here
 CONTENT_MARK = "@"  # separates a folder's name from the first digits of its content digest
 CHUNK = 1 << 22  # bytes hashed at a time
 
@@ -104,11 +106,12 @@ def find_problems(
     Args:
         folder: of the weights.
         weights: their entry of the registry.
-        locked: the lock entry of the pull; without one, only missing files are found.
+        locked: the lock entry of the pull; without one, only missing files and unfinished downloads are found.
         cache: as in `digests`.
     """
     if locked is None:
-        return _missing(folder, weights.parts)
+        begun = any((folder / PARTIAL).rglob("*.incomplete"))
+        return find_missing(folder, weights.parts) | ({PARTIAL: "has unfinished files"} if begun else {})
     wrong: dict[str, str] = {}
     for name, file in locked.files.items():
         path = folder / name
@@ -120,6 +123,34 @@ def find_problems(
     changed = {path.relative_to(folder).as_posix(): digest for path, digest in have.items()}
     other = {name for name, digest in changed.items() if digest != locked.files[name].sha256}
     return wrong | dict.fromkeys(sorted(other), "differs from the pulled file (sha256)")
+
+
+def find_missing(folder: Path, parts: tuple[str, ...]) -> dict[str, str]:
+    """Return missing parts and shards, models without tensors, and lists of them that cannot be read.
+
+    Args:
+        folder: of the weights.
+        parts: needed folders or files; empty: the folders that model_index.json lists.
+    """
+    missing = {part: "is missing" for part in parts if not (folder / part).exists()}
+    files = list(_files(folder, parts))
+    if not any(path.suffix in TENSOR_SUFFIXES for path in files):
+        missing[folder.name] = NO_TENSORS
+    for path in files:
+        here = {other.name for other in files if other.parent == path.parent}
+        if path.name == "config.json" and not any(Path(name).suffix in TENSOR_SUFFIXES for name in here):
+            missing[path.parent.name] = NO_TENSORS
+        try:
+            if path.name.endswith(".index.json"):
+                shards = set(json.loads(path.read_text(encoding="utf-8")).get("weight_map", {}).values())
+                absent = [path.with_name(shard).relative_to(folder).as_posix() for shard in sorted(shards - here)]
+                missing |= dict.fromkeys(absent, "is missing")
+            elif path == folder / "model_index.json" and not parts:
+                listed = _components(json.loads(path.read_text(encoding="utf-8")))
+                missing |= {name: "is missing" for name in listed if not (folder / name).is_dir()}
+        except (OSError, ValueError, TypeError, AttributeError):
+            missing[path.relative_to(folder).as_posix()] = "cannot be read"
+    return missing
 
 
 def find_unpublished(folder: Path, weights: Weights) -> dict[str, str]:
@@ -198,20 +229,13 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
             yield path
 
 
-def _missing(folder: Path, parts: tuple[str, ...]) -> dict[str, str]:
-    """Return missing parts, models without tensors, and shards that an index lists but the folder lacks."""
-    missing = {part: "is missing" for part in parts if not (folder / part).exists()}
-    files = list(_files(folder, parts))
-    if not any(path.suffix in TENSOR_SUFFIXES for path in files):
-        missing[folder.name] = NO_TENSORS
-    for path in files:
-        here = {other.name for other in files if other.parent == path.parent}
-        if path.name == "config.json" and not any(Path(name).suffix in TENSOR_SUFFIXES for name in here):
-            missing[path.parent.name] = NO_TENSORS
-        if path.name.endswith(".index.json"):
-            shards = set(json.loads(path.read_text(encoding="utf-8")).get("weight_map", {}).values())
-            missing |= {f"{path.parent.name}/{shard}": "is missing" for shard in sorted(shards - here)}
-    return missing
+def _components(model_index: dict[str, Any]) -> list[str]:
+    """Return the folders of a pipeline of diffusers; an absent component is a list of nulls."""
+    return [
+        name
+        for name, classes in model_index.items()
+        if not name.startswith("_") and isinstance(classes, list) and any(classes)
+    ]
 
 
 def _digests_of(files: list[Path], cache: Path | None) -> dict[Path, str]:

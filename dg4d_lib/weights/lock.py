@@ -40,6 +40,11 @@ class LockEntry(BaseModel):
     license: str = ""
     files: dict[str, LockedFile]
 
+    @property
+    def digests(self) -> set[str]:
+        """Digests of all files."""
+        return {file.sha256 for file in self.files.values()}
+
 
 def read_lock(home: Path) -> dict[str, LockEntry]:
     """Read the lock of the weights folder `home`, by name; empty if there is no lock file.

@@ -11,9 +11,11 @@ from typing import Any
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.weights.locate import (
     DIGEST_CACHE,
+    PARTIAL,
     READABLE_SUFFIXES,
     TENSOR_SUFFIXES,
     digests,
+    find_missing,
     find_problems,
     folder_name,
     is_part,
@@ -28,9 +30,7 @@ FORMATS = (
     (True, ".bin"),
     (False, ".bin"),
 )  # (half precision, suffix), preferred first
-
-
-PARTIAL = ".cache/huggingface/download"  # in the folder of a download: where the client keeps unfinished files
+BEGUN = f"{PARTIAL}/pull.incomplete"  # present until a pull is recorded; counts as an unfinished file
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,9 @@ def plan_pull(weights: Weights, home: Path) -> PullPlan:
     hub = _client()
     before = read_lock(home).get(weights.name)
     folder = home / folder_name(weights)
-    for name in find_problems(folder, weights, before, home / DIGEST_CACHE) if before else ():
-        (folder / name).unlink(missing_ok=True)  # the downloader may consider a damaged file complete
+    for name in find_problems(folder, weights, before, home / DIGEST_CACHE):
+        if (folder / name).is_file():
+            (folder / name).unlink()  # the downloader may consider a damaged file complete
     with _hub_errors(weights):
         info = hub.HfApi().model_info(
             weights.hub_id, revision=before.revision if before else weights.revision, files_metadata=True
@@ -116,13 +117,15 @@ def plan_pull(weights: Weights, home: Path) -> PullPlan:
 def download(plan: PullPlan, home: Path) -> LockEntry:
     """Download the files of a plan, verify them and record them in the lock; see `pull`."""
     hub, weights, folder = _client(), plan.weights, plan.folder
-    folder.mkdir(parents=True, exist_ok=True)
+    (folder / PARTIAL).mkdir(parents=True, exist_ok=True)
+    (folder / BEGUN).touch()
     with _hub_errors(weights):
         hub.snapshot_download(
             weights.hub_id, revision=plan.revision or None, local_dir=folder, allow_patterns=list(plan.sizes)
         )
     have = {name: digest for name, digest in digests(folder, cache=home / DIGEST_CACHE).items() if name in plan.sizes}
-    wrong = {name: "was not downloaded" for name in plan.sizes if name not in have} | find_problems(folder, weights)
+    wrong = {name: "was not downloaded" for name in plan.sizes if name not in have}
+    wrong |= find_missing(folder, weights.parts)
     for name in [name for name, digest in have.items() if plan.published.get(name, digest) != digest]:
         wrong[name] = "is damaged"
         (folder / name).unlink()
@@ -134,6 +137,7 @@ def download(plan: PullPlan, home: Path) -> LockEntry:
     files = {name: LockedFile(sha256=have[name], size=(folder / name).stat().st_size) for name in plan.sizes}
     locked = LockEntry(hub_id=weights.hub_id, revision=plan.revision, license=plan.license, files=files)
     write_lock(home, weights.name, locked)
+    (folder / BEGUN).unlink(missing_ok=True)
     return locked
 
 

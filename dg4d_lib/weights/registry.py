@@ -5,7 +5,8 @@ have them. The first `dg4d weights pull` compares its download with them and rec
 use is compared with that record. Files without a public digest are trusted on first use.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -79,6 +80,8 @@ CARD_LICENSES: dict[str, Commercial] = {
     **dict.fromkeys(("openrail", "openrail++", "creativeml-openrail-m", "bigscience-openrail-m"), "conditions"),
     **dict.fromkeys(("cc-by-nc-4.0", "cc-by-nc-sa-4.0", "cc-by-nc-nd-4.0"), "no"),
 }  # license ids on model cards of the hub
+STRICTNESS: tuple[Commercial, ...] = ("yes", "conditions", "unverified", "no")  # strictest last
+REUSED_PARTS = ("vae/", "text_encoder/", "image_encoder/")  # many models share these files; they identify none
 TERMS: dict[Commercial, str] = {
     "yes": "commercial use is allowed",
     "conditions": "commercial use is allowed, but not for the purposes that the license lists",
@@ -346,18 +349,36 @@ KNOWN: dict[str, Weights] = {
 }
 
 
-def lookup_weights(name: str, card: str = "") -> Weights:
+def lookup_weights(name: str, card: str = "", digests: Collection[str] = ()) -> Weights:
     """Return the registered weights of a name or a hub id, or an entry for unknown ones.
 
     Args:
-        name: from the user.
-        card: license id on the model card, used for unknown weights. A copy inherits the license of the original: a
-            name that contains the name of registered weights without commercial use gets their license.
+        name: from the user; or the path of a folder.
+        card: license id on the model card, used for unknown weights.
+        digests: sha256 of their files, where known; used for unknown weights.
     """
     by_id = {weights.hub_id.lower(): weights for weights in KNOWN.values()}
+    known = KNOWN.get(name) or by_id.get(name.lower())
+    return known or Weights(name, name, "given by the user", _license_of_unknown(name, card, digests))
+
+
+def _license_of_unknown(name: str, card: str, digests: Collection[str]) -> License:
+    """Return the strictest license: of the card, and of registered weights that share the name or a file."""
     commercial = CARD_LICENSES.get(card, "unverified")
-    inherited = License(card or "unknown license", commercial, TERMS[commercial])
-    for weights in KNOWN.values():
-        if weights.license.commercial == "no" and weights.name in name.lower():
-            inherited = weights.license
-    return KNOWN.get(name) or by_id.get(name.lower()) or Weights(name, name, "given by the user", inherited)
+    of_card = License(card or "unknown license", commercial, TERMS[commercial])
+    copied = [one.license for one in KNOWN.values() if _names(one, name) or _own_digests(one) & set(digests)]
+    return max((*copied, of_card), key=lambda one: STRICTNESS.index(one.commercial))
+
+
+def _own_digests(weights: Weights) -> set[str]:
+    return {digest for path, digest in weights.published.items() if not path.startswith(REUSED_PARTS)}
+
+
+def _names(weights: Weights, name: str) -> bool:
+    """Return True if a name has that of registered weights, or of their repository, as whole words."""
+    repository = weights.hub_id.rpartition("/")[2]
+    return any(_words(one) in _words(name) for one in (weights.name, repository))
+
+
+def _words(name: str) -> str:
+    return "-" + re.sub(r"[\W_]+", "-", name.lower()) + "-"

@@ -203,9 +203,12 @@ def watch(
 
         check_writable(out)
         connect()
+        import httpx
+
         from flows.serving.results import Results
         from flows.serving.roots import granted
         from flows.serving.watching import Watcher, announce, check_registered
+        from flows.ui.showing import revive
 
         check_registered()
         name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
@@ -213,14 +216,22 @@ def watch(
         typer.echo(f"watching {watcher.folder}; packages go to {watcher.out}; stop with Ctrl-C")
         results = Results(watcher.out)
         with granted(watcher.folder, watcher.out):
-            looked = 0.0
+            looked, away = 0.0, False
             while True:
                 if time.monotonic() - looked >= RESULTS_EVERY_S:
                     for line in results.look():
                         typer.echo(line)
                     looked = time.monotonic()
                 if (digest := watcher.look(time.monotonic())) is not None:
-                    announce(watcher.folder, watcher.out, digest)
-                    watcher.told(digest)
-                    typer.echo(f"files came to rest; sent to the server: {digest}")
+                    try:
+                        announce(watcher.folder, watcher.out, digest)
+                    except httpx.TransportError:
+                        if not away:
+                            typer.echo("the server does not answer; the files are announced when it does", err=True)
+                        away = True
+                        revive()
+                    else:
+                        away = False
+                        watcher.told(digest)
+                        typer.echo(f"files came to rest; sent to the server: {digest}")
                 time.sleep(POLL_S)

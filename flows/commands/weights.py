@@ -159,8 +159,8 @@ def _all_of_them() -> list["Weights"]:
     from dg4d_lib.weights.registry import KNOWN, lookup_weights
     from steps.runtime.weights import weights_home
 
-    pulled = {name: locked.license for name, locked in read_lock(weights_home()).items()}
-    return [*KNOWN.values(), *(lookup_weights(name, card) for name, card in pulled.items() if name not in KNOWN)]
+    pulled = {name: one for name, one in read_lock(weights_home()).items() if name not in KNOWN}
+    return [*KNOWN.values(), *(lookup_weights(name, one.license, one.digests) for name, one in pulled.items())]
 
 
 def _place(one: "Weights") -> Path | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -33,6 +34,7 @@ class StepEvent:
 
 Listener = Callable[[StepEvent], None]
 _listeners: list[Listener] = []
+_of_context: ContextVar[tuple[Listener, ...]] = ContextVar("of_context", default=())
 
 
 @contextmanager
@@ -45,7 +47,20 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
+@contextmanager
+def listening_in_context(listener: Listener) -> Iterator[None]:
+    """Call `listener` with the events of conversions that begin in this context while the block runs.
+
+    Threads that run steps get a copy of the context of their conversion.
+    """
+    token = _of_context.set((*_of_context.get(), listener))
+    try:
+        yield
+    finally:
+        _of_context.reset(token)
+
+
 def emit(event: StepEvent) -> None:
-    """Call every listener with an event."""
-    for listener in tuple(_listeners):
+    """Call the listeners of this process and of this context with an event."""
+    for listener in (*_listeners, *_of_context.get()):
         listener(event)

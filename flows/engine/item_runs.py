@@ -63,6 +63,10 @@ class ItemFailed(DG4DError):
         super().__init__(outcome.message)
         self.outcome, self.step, self.pictures = outcome, outcome.step or STEP, outcome.pictures
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the argument of `__init__`; `args` holds the message."""
+        return type(self), (self.outcome,)
+
 
 class ItemDeployment(NamedTuple):
     """Deployment that converts items.

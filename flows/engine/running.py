@@ -135,4 +135,12 @@ def finish_step(item: str, label: str, result: StepResult, cached: bool, seconds
     return StepRun(label=label, cached=cached, wall_s=round(seconds, 3), waited_s=round(waited_s, 3), result=result)
 
 
+def fail_step(item: str, label: str, seconds: float, interrupted: bool = False) -> None:
+    """Emit the event of a step that did not finish; one that the user stopped is not called failed."""
+    if interrupted or resources.stopping.is_set():
+        emit(StepEvent(item, label, "note", text=f"interrupted after {seconds:.1f} s"))
+    else:
+        emit(StepEvent(item, label, "failed", seconds=seconds))
+
+
 _observer: ContextVar[StepObserver | None] = ContextVar("observer", default=None)

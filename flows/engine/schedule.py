@@ -4,7 +4,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from flows import home
@@ -14,11 +14,16 @@ from steps.store.files import write_atomically
 USUAL_S: Mapping[str, float] = {  # seconds of the profile `preview` on two cores; only their ratios count
     "draw_picture": 60.0,
     "prepare_subject": 1.0,
+    "prepare_views": 3.0,
+    "generate_views": 60.0,  # a diffusion model, as in draw_picture
+    "prepare_asset": 5.0,
+    "animate_asset": 100.0,
     "drive_video": 1.0,
     "fit_gaussians": 10.0,
     "fit_motion": 47.0,
     "plan_mesh": 6.0,
     "extract_mesh": 38.0,
+    "join_meshes": 3.0,
     "refine_texture": 60.0,
     "pack_asset": 12.0,
     "check_asset": 3.0,
@@ -39,7 +44,7 @@ class Schedule:
     def __init__(self, steps: Sequence[str], expected: Mapping[str, float] | None = None) -> None:
         self.steps = list(steps)
         known = {name: value for name, value in (expected or {}).items() if name in USUAL_S}
-        pace = sum(known.values()) / sum(USUAL_S[name] for name in known) if known else 1.0
+        pace = _pace((seconds, USUAL_S[name]) for name, seconds in known.items())
         self._expected = {name: known.get(name, pace * USUAL_S.get(name, 1.0)) for name in self.steps}
         self._is_measured = bool(known)
         self._began: dict[str, float] = {}
@@ -97,20 +102,24 @@ class Schedule:
         """
         now = time.monotonic() if now is None else now
         with self._lock:
-            worked, planned, rest = 0.0, 0.0, []
+            worked: list[tuple[float, float]] = []  # actual and expected seconds
+            rest = []
             for name, expected in self._expected.items():
                 if name in self._ended:
                     seconds, cached = self._ended[name]
-                    worked, planned = (worked, planned) if cached else (worked + seconds, planned + expected)
+                    worked += [] if cached else [(seconds, expected)]
                     continue
                 fraction = min(self._fraction.get(name, 0.0), 1.0)
                 elapsed = now - self._began[name] if name in self._began else 0.0
                 if fraction >= OWN_PACE:
-                    worked, planned = worked + elapsed, planned + fraction * expected
+                    worked.append((elapsed, fraction * expected))
                 rest.append((expected, fraction, elapsed))
-            if not self._is_measured and planned < KNOWN_SHARE * sum(self._expected.values()):
+            least = KNOWN_SHARE * sum(self._expected.values())
+            if self._is_measured:
+                worked.append((least, least))  # as fast as in the earlier conversion until more is known
+            elif sum(expected for _, expected in worked) < least:
                 return None
-            pace = worked / planned if planned else 1.0
+            pace = _pace(worked)
             return sum((_left(expected * pace, fraction, elapsed) for expected, fraction, elapsed in rest), 0.0)
 
     def durations(self) -> dict[str, float]:
@@ -156,6 +165,20 @@ def _left(expected: float, fraction: float, elapsed: float) -> float:
     if fraction >= OWN_PACE:
         return elapsed * (1 - fraction) / fraction
     return max(expected - elapsed, 0.1 * expected)
+
+
+def _pace(worked: Iterable[tuple[float, float]]) -> float:
+    """Return the median of actual / expected seconds, weighted by the expected ones; 1 if there are none.
+
+    A mean would let one short step that took long multiply all others.
+    """
+    ratios = sorted((actual / expected, expected) for actual, expected in worked if expected > 0)
+    half = sum(expected for _, expected in ratios) / 2
+    for ratio, expected in ratios:
+        half -= expected
+        if half <= 0:
+            return ratio
+    return 1.0
 
 
 def _read(path: Path) -> dict[str, object]:

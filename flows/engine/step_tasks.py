@@ -24,12 +24,11 @@ from prefect.transactions import IsolationLevel
 from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.engine.caching import RequestPolicy
-from flows.engine.events import StepEvent, emit
 from flows.engine.executors import stop_all
 from flows.engine.file_locks import FileLocks
 from flows.engine.orphans import claim_run
 from flows.engine.requests import in_order, label_of, request_for
-from flows.engine.running import RETRIES, RETRY_DELAY_S, finish_step, may_succeed, observed_by
+from flows.engine.running import RETRIES, RETRY_DELAY_S, fail_step, finish_step, may_succeed, observed_by
 from flows.formatting.escaping import markdown
 from flows.formatting.numbers import format_number
 from flows.packages.flow_result import StepRun
@@ -74,7 +73,7 @@ def note_end(task: Task[..., Any], run: TaskRun, state: State[Any]) -> None:
     seconds = (datetime.now(UTC) - run.start_time).total_seconds() if run.start_time else 0.0
     waited_s = _waited.pop(str(run.id), 0.0)
     if not state.is_completed():
-        emit(StepEvent(item, label, "failed", seconds=seconds))
+        fail_step(item, label, seconds)
         return
     result = state.result(raise_on_failure=False)
     assert isinstance(result, StepResult) and run.flow_run_id  # tasks of steps return one, and run in flows

@@ -1,5 +1,6 @@
 """Rows of a manifest (CSV, JSON, JSON Lines, Parquet), read independently: a faulty row does not affect others."""
 
+import codecs
 import csv
 import io
 import re
@@ -67,7 +68,10 @@ def _table(file: Path) -> list[ManifestRow]:
     kind = file.suffix.lower()
     if kind == ".parquet":
         return _parquet(file)
-    text = file.read_bytes().removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")
+    content = file.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError(NOT_UTF8)
+    text = content.removeprefix(codecs.BOM_UTF8).decode(errors="surrogateescape")
     if kind == ".csv":
         return _csv(text)
     if kind == ".jsonl":

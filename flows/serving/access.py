@@ -115,7 +115,9 @@ class SignIn:
         if is_authorized(request.headers.get("authorization"), self._secret) or self._has_session(request):
             return
         if request.headers.get("sec-fetch-dest") == "document":
-            raise HTTPException(303, headers={"Location": f"{LOGIN}?next={quote(request.scope['path'])}"})
+            query = f"?{request.url.query}" if request.url.query else ""
+            wanted = quote(request.scope["path"]) + query
+            raise HTTPException(303, headers={"Location": f"{LOGIN}?next={quote(wanted)}"})
         raise HTTPException(401, "Unauthorized: sign in at the address that `dg4d up` prints.")
 
     def session(self, request: Request) -> Response:

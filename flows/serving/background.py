@@ -1,6 +1,7 @@
 """Background server of this user."""
 
 import os
+from pathlib import Path
 
 from flows.home import make_private, set_environment
 from flows.serving.server import Server
@@ -14,6 +15,13 @@ def background_server() -> Server:
 
 
 def set_own_server(server: Server, address: str) -> None:
-    """Call `set_environment` for the background server, with its secret in place of that of another server."""
+    """Use the background server for the rest of this process.
+
+    Calls `set_environment` with its secret in place of that of another server.
+    """
+    _used[server.folder] = server
     os.environ["PREFECT_API_AUTH_STRING"] = server.auth_string()
     set_environment(f"{address}/api")
+
+
+_used: dict[Path, Server] = {}  # kept alive: a server ends when no process uses it

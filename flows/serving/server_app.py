@@ -37,8 +37,8 @@ def create_app() -> ASGIApp:
     sign_in = SignIn(secret)
     file = "{digest}/{size}/{name}"
     signed_in = [Depends(sign_in.required)]
-    add_first(application, ARTIFACT_ADDRESS + file, artifact, dependencies=signed_in)
-    add_first(application, VIEWER_ADDRESS + file, viewer, dependencies=signed_in)
+    add_first(application, ARTIFACT_ADDRESS + file, artifact, methods=["GET", "HEAD"], dependencies=signed_in)
+    add_first(application, VIEWER_ADDRESS + file, viewer, methods=["GET", "HEAD"], dependencies=signed_in)
     load_object(STUDIO)(application, sign_in, secret)
     add_first(application, LOGIN, sign_in.page)
     add_first(application, SESSION, sign_in.session)

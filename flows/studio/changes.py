@@ -6,6 +6,7 @@ from fastapi import HTTPException, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
 
 from dg4d_lib.errors import BadInput
 from flows import home
@@ -20,6 +21,7 @@ from steps.contract import LARGEST_SEED, Frozen
 T = TypeVar("T", bound=BaseModel)
 
 LARGEST_JSON = 2**20  # bytes of a request
+CLOSED = 499  # status, for the log alone: the client ended the request
 
 
 class Region(Frozen):
@@ -69,7 +71,10 @@ class Changes:
     async def upload(self, request: Request) -> Response:
         """Keep one file of a draft, streamed as the body; its name is in the query."""
         draft = Draft(request.path_params["identifier"])
-        kept = await draft.receive(request.query_params.get("name", ""), request.stream())
+        try:
+            kept = await draft.receive(request.query_params.get("name", ""), request.stream())
+        except ClientDisconnect:
+            return Response(status_code=CLOSED)
         return _json({"name": kept.name, "kind": kept.kind}, 201)
 
     async def mask(self, request: Request) -> Response:
@@ -107,8 +112,7 @@ class Changes:
 
     async def cancel(self, request: Request) -> Response:
         """Ask for the end of a conversion."""
-        run = await self._api.run(request.path_params["identifier"])
-        await self._api.cancel(run["id"])
+        await self._api.cancel(await self._api.run(request.path_params["identifier"]))
         return _json({})
 
     async def retry(self, request: Request) -> Response:

@@ -237,14 +237,22 @@ def _all_versions(store: ArtifactStore) -> list[Version]:
 
 def _output(version: Version, step: str, port: str) -> dict[str, Any] | None:
     digest = next((each.outputs[port] for each in version.steps if each.label == step and port in each.outputs), None)
-    return None if digest is None else _json(home.store().address, digest)
+    if digest is not None:
+        with suppress(ValueError, DG4DError, OSError):
+            return _json(home.store().address, digest)
+    return None
 
 
 @functools.lru_cache(4096)
-def _json(_store: str, digest: str) -> dict[str, Any] | None:
-    """Return a small JSON artifact; None if it is gone or damaged."""
-    with suppress(ValueError, DG4DError, OSError):
-        content = home.store().read(object_name(digest))
-        tree = None if content is None else json.loads(content)
-        return tree if isinstance(tree, dict) else None
-    return None
+def _json(_store: str, digest: str) -> dict[str, Any]:
+    """Return a small JSON artifact; failures are raised, for the cache would keep a returned None.
+
+    Raises:
+        ValueError: it is gone or damaged.
+        DG4DError: the store does not answer.
+    """
+    content = home.store().read(object_name(digest))
+    tree = None if content is None else json.loads(content)
+    if not isinstance(tree, dict):
+        raise ValueError(f"{digest} is gone, or no JSON object")
+    return tree

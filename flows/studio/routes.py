@@ -6,6 +6,7 @@ no other page can send it, and the cookie, which other servers of this host may 
 
 import zipfile
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
@@ -26,15 +27,17 @@ from flows.studio.changes import Changes
 from flows.studio.drafts import TooLarge
 from flows.studio.pages import HEADERS, Pages
 from flows.studio.server_api import ServerApi
+from steps.artifacts.archives import can_exist, stays_inside
 from steps.contract import ArtifactRef, settings_errors
 from steps.store.artifact_store import ArtifactMissing
-from steps.store.files import DiskFull
+from steps.store.files import DiskFull, remove_tree, write_atomically
 
 Answer = Callable[[Request], Awaitable[Response]]
 
 STATIC = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 INLINE = {".png": "image/png", ".webp": "image/webp", ".mp4": "video/mp4"}  # entries of zips; others are downloads
 FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}  # of content that its address names
+MOST_EXTRACTED = 100  # zips of which extracted files are kept
 
 
 class Route(NamedTuple):
@@ -64,9 +67,9 @@ def add_routes(application: FastAPI, sign_in: SignIn, secret: str) -> None:
             raise HTTPException(401, "Unauthorized: sign in again at the address that `dg4d studio` prints.")
 
     for route in routes(ServerApi(application, secret)):
-        method, needed = ("POST", with_secret) if route.changes else ("GET", sign_in.required)
+        methods, needed = (["POST"], with_secret) if route.changes else (["GET", "HEAD"], sign_in.required)
         answer = _explained(route.answer)
-        add_first(application, STUDIO_ADDRESS + route.path, answer, methods=[method], dependencies=[Depends(needed)])
+        add_first(application, STUDIO_ADDRESS + route.path, answer, methods=methods, dependencies=[Depends(needed)])
 
 
 def routes(api: ServerApi) -> list[Route]:
@@ -115,19 +118,40 @@ async def thumbnail(request: Request) -> Response:
 async def entry(request: Request) -> Response:
     """Return a file inside a zip of the store."""
     ref, name = _ref(request), request.path_params["name"]
+    path = await run_in_threadpool(lambda: _extracted(ref, name))
+    kind = INLINE.get(path.suffix)
+    return FileResponse(
+        path,
+        media_type=kind or "application/octet-stream",
+        headers={**FOREVER, "Content-Security-Policy": "sandbox; default-src 'none'"},
+        filename=path.name,
+        content_disposition_type="inline" if kind else "attachment",
+    )
 
-    def read() -> bytes:
-        try:
-            with zipfile.ZipFile(home.store().path(ref)) as archive:
-                return archive.read(name)
-        except (zipfile.BadZipFile, KeyError) as error:
-            raise LookupError(f"there is no file {name!r} here") from error
 
-    content = await run_in_threadpool(read)
-    kind = INLINE.get(PurePath(name).suffix)
-    shown = f'{"inline" if kind else "attachment"}; filename="{PurePath(name).name}"'
-    headers = {**FOREVER, "Content-Disposition": shown, "Content-Security-Policy": "sandbox; default-src 'none'"}
-    return Response(content, media_type=kind or "application/octet-stream", headers=headers)
+def _extracted(ref: ArtifactRef, name: str) -> Path:
+    """Return a file inside a zip of the store, extracted below the studio's folder: players ask for ranges of it.
+
+    Raises:
+        LookupError: there is no such file.
+    """
+    folder = home.studio() / "entries" / ref.digest.removeprefix("sha256:")
+    path = folder / name
+    try:
+        if not stays_inside(name) or not can_exist(name):
+            raise KeyError(name)
+        if path.is_file():
+            return path
+        with zipfile.ZipFile(home.store().path(ref)) as archive:
+            content = archive.read(name)
+    except (zipfile.BadZipFile, KeyError) as error:
+        raise LookupError(f"there is no file {name!r} here") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, content)
+    with suppress(FileNotFoundError):  # another request may be removing the same ones
+        for old in sorted(folder.parent.iterdir(), key=lambda each: each.stat().st_mtime)[:-MOST_EXTRACTED]:
+            remove_tree(old)
+    return path
 
 
 def _ref(request: Request) -> ArtifactRef:

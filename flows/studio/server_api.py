@@ -12,7 +12,7 @@ from flows.serving.auth import basic
 
 TAG = "studio"  # of the runs that the page started
 PAGE = 200  # rows in one answer of the server
-ENDED = {"COMPLETED", "FAILED", "CANCELLED", "CRASHED"}
+ENDED = {"COMPLETED", "FAILED", "CANCELLED"}  # a crashed run is started again by itself
 
 Row = dict[str, Any]
 
@@ -95,14 +95,15 @@ class ServerApi:
             "artifacts", {"artifacts": {"flow_run_id": {"any_": list(runs)}}, "sort": "UPDATED_DESC", "limit": PAGE}
         )
 
-    async def cancel(self, identifier: str) -> None:
-        """Ask for the end of a run; one that has not begun never begins.
+    async def cancel(self, run: Row) -> None:
+        """Ask for the end of a run; one that has not begun never begins, and a crashed one is not started again.
 
         Raises:
             HTTPException: 409; it cannot be cancelled.
         """
-        state = {"type": "CANCELLING", "name": "Cancelling", "message": "cancelled in the studio"}
-        answer = await self._client.post(f"/flow_runs/{identifier}/set_state", json={"state": state})
+        kind = "CANCELLED" if run["state_type"] == "CRASHED" else "CANCELLING"  # nothing runs that could be ended
+        state = {"type": kind, "name": kind.capitalize(), "message": "cancelled in the studio"}
+        answer = await self._client.post(f"/flow_runs/{run['id']}/set_state", json={"state": state})
         reached = (answer.json().get("state") or {}).get("type") if answer.is_success else None
         if reached not in {"CANCELLING", "CANCELLED"}:  # of a run that has no process yet it is the latter
             raise HTTPException(409, "this conversion has ended and cannot be cancelled")

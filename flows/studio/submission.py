@@ -86,7 +86,8 @@ def convert(draft: Draft, wanted: Submission) -> RunRequest:
         return _batch(draft, wanted)
     first, key = draft.first(), secrets.token_hex(6)
     item = _item(wanted.name or first.path.stem)
-    source = str(draft.link(key, item + first.path.suffix, first.path))
+    # always with a suffix, because the name of the asset is the file's without it, and may have dots
+    source = str(draft.link(key, item + (first.path.suffix or f".{first.kind}"), first.path))
     parameters: dict[str, Any] = {"out": str(output_folder(item) / key)}
     parameters["options"] = _options(wanted, with_motion=first.kind != "video")
     flow, title = f"{first.kind}-to-4d", first.kind.capitalize()

@@ -86,9 +86,14 @@ def require_weights(names: Iterable[str]) -> None:
 
 
 def license_of(name: str) -> License:
-    """Return the license of weights from the registry, else from the model card that was downloaded with them."""
-    locked = read_lock(weights_home()).get(name)
-    return lookup_weights(name, locked.license if locked else _card_of(name)).license
+    """Return the license of weights from the registry, else by their files, their name or path, and their card."""
+    if locked := read_lock(weights_home()).get(name):
+        return lookup_weights(name, locked.license, locked.digests).license
+    with suppress(BadInput, BackendUnavailable):
+        if CONTENT_MARK in name or given_folder(name) is not None:
+            folder = find_weights(name, weights_home())
+            return lookup_weights(str(folder), card_license(folder), set(_digests(name, folder).values())).license
+    return lookup_weights(name).license
 
 
 def license_note(name: str) -> str:
@@ -104,14 +109,6 @@ def offload_notes(offload: str) -> tuple[str, ...]:
         if offload in parts
         else ()
     )
-
-
-def _card_of(name: str) -> str:
-    """Return the license id on the model card in a user's folder; empty for names and without a card."""
-    with suppress(BadInput, BackendUnavailable):
-        if CONTENT_MARK in name or given_folder(name) is not None:
-            return card_license(find_weights(name, weights_home()))
-    return ""
 
 
 def weights_in(tree: Mapping[str, Any]) -> Iterator[str]:

@@ -43,7 +43,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 
 
 def thinned_rate(fps: float, count: int, kept: int) -> float:
-    """Return the frame rate at which `kept` of `count` frames last as long as all of them."""
+    """Return the rate at which `kept` evenly spaced frames of `count` move as fast as all of them do."""
     return fps * (kept - 1) / (count - 1) if count > 1 else fps
 
 

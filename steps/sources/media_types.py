@@ -43,7 +43,11 @@ CLIPS = (  # offset of a signature, the signature, FFmpeg's name of the containe
     (0, b"OggS", "ogg"),
     (0, b"\0\0\x01\xba", "mpeg"),
 )
-UNREADABLE_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"avis": "animated AVIF"}
+HEIC = "HEIC pictures cannot be read here; export the picture as PNG or JPEG"
+UNREADABLE_BRANDS = {
+    **dict.fromkeys((b"heic", b"heix", b"mif1"), HEIC),
+    b"avis": "animated AVIF cannot be read here; export the animation as MP4, GIF or WebP",
+}
 PICTURE_SUFFIXES = {
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm",
     ".pgm",
@@ -84,8 +88,7 @@ def container_of(head: bytes) -> str:
     if is_avif(head):
         return ""
     if head[4:8] == b"ftyp" and head[8:12] in UNREADABLE_BRANDS:
-        name = UNREADABLE_BRANDS[head[8:12]]
-        raise BadInput(f"{name} pictures cannot be read here; export the picture as PNG or JPEG")
+        raise BadInput(UNREADABLE_BRANDS[head[8:12]])
     if is_text(head):
         return ""
     if len(head) > 188 and {head[at] for at in range(0, min(len(head), 377), 188)} == {0x47}:

@@ -56,7 +56,7 @@ class Source:
     Attributes:
         frames: straight sRGB and alpha in [0, 1], upright; a picture is one frame.
         has_alpha: True if some pixel is not opaque.
-        fps: frames per second after sampling, which keeps the duration.
+        fps: frames per second after sampling, which keeps the speed of the motion.
         kind: picture or video.
         size: width and height of the upright file in pixels, before shrinking.
         count: frames of the file, of which `frames` may be a part.
@@ -129,7 +129,7 @@ def _video(
 ) -> Source:
     kept = frames.shape[0]
     if kept < count:
-        notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; it lasts as long as before.")
+        notes = (*notes, f"{kept} of the video's {count} frames are used, evenly spaced; they play at the same speed.")
     rate = thinned_rate(fps, count, kept)
     return Source(frames, has_alpha and _is_transparent(frames), rate, "video", size, count, notes)
 

@@ -29,7 +29,9 @@ COPIES = 6  # copies of a band while colors are converted and multiplied by alph
 THREADS = 2  # of OpenImageIO; each has its own buffers
 READ_WHOLE = (".ppm", ".pgm", ".webp", ".jxl", ".jp2")  # formats whose files OpenImageIO reads into memory
 HELD_BYTES = {"webp": 6.0}  # bytes per pixel that a decoder holds, measured
-TIFF_CONVERTED = (6, 8, 9, 10)  # photometric interpretations: YCbCr, CIE Lab, ICC Lab, ITU Lab
+PHOTOMETRIC = "tiff:PhotometricInterpretation"
+TIFF_YCBCR = 6
+TIFF_LAB = (8, 9, 10)  # CIE Lab, ICC Lab, ITU Lab
 
 FLOATS = ("half", "float", "double")
 HALF = 0.5  # alpha from which a pixel has a value
@@ -103,7 +105,7 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
     file, held = _open(path, what, limit)
     try:
         spec = file.spec()
-        _check_flat(spec, what)
+        _check_kind(file, what)
         still = _Still(file, what)
         limit.require(still.needed_bytes(held), what, spec.width, spec.height)
         shrinker = BandDownscaler(still.height, still.width, longest)
@@ -154,7 +156,7 @@ def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: i
     file, held = _open(path, what, limit)
     try:
         spec = file.spec()
-        _check_flat(spec, what)
+        _check_kind(file, what)
         still = _Still(file, what, depth=True)
         limit.require(still.needed_bytes(held), what, spec.width, spec.height)
         orientation = int(spec.get_int_attribute("Orientation", 1))
@@ -176,12 +178,15 @@ def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: i
     return StillValues(values, known, str(spec.format) in FLOATS, tint, size)
 
 
-def _check_flat(spec: oiio.ImageSpec, what: str) -> None:
-    """Refuse sizes out of range, deep pictures and volumes."""
+def _check_kind(file: oiio.ImageInput, what: str) -> None:
+    """Refuse sizes out of range, deep pictures, volumes and Lab colors, which libtiff converts with a yellow cast."""
+    spec = file.spec()
     check_size(spec.width, spec.height, what)
     if spec.deep or spec.depth > 1:
         kind = "has several samples per pixel (deep data)" if spec.deep else "is a volume of several slices"
         raise BadInput(f"{what} {kind}, which cannot be read here; export it flattened, as PNG or EXR")
+    if file.format_name() == "tiff" and spec.get_int_attribute(PHOTOMETRIC, 0) in TIFF_LAB:
+        raise BadInput(f"{what} is a TIFF with Lab colors, which cannot be read here; export it with RGB colors")
 
 
 def _nearest(count: int, length: int) -> ndarray:
@@ -314,7 +319,7 @@ class _Still:
         band = self._rows * max(self.width, -(-self.width // max(1, spec.tile_width)) * spec.tile_width)
         native = spec.pixel_bytes(True)
         held = max(held, HELD_BYTES.get(self._file.format_name(), 0.0))
-        if spec.get_int_attribute("tiff:PhotometricInterpretation", 0) in TIFF_CONVERTED:
+        if spec.get_int_attribute(PHOTOMETRIC, 0) == TIFF_YCBCR:
             held = max(held, 4.0)  # libtiff converts the whole picture to 8-bit RGBA
         work = band * (2 * native + 4 * (self._last - self._first) + COPIES * 16)
         return held * pixels + work + 16 * min(pixels, LARGEST_SIDE**2)

@@ -269,6 +269,15 @@ def test_it_plays_at_once_answers_hands_and_keys_and_asks_no_network(tried: Try)
     assert "1. fit" in page.said["facts"]
 
 
+def test_a_still_page_stays_still_answers_space_on_buttons_and_survives_a_lost_context(tried: Try) -> None:
+    deeds = [["wait", 0.2], ["focus", "button[data-show=splats]"], ["press", "Space"], ["lose"],
+             ["focus", "#play"], ["press", "Space"]]  # fmt: skip
+    page = tried(write_glb(egg()), splats(), deeds=deeds, reducedMotion="reduce")
+    ready, *_, cloud, lost, _, played = page.said["states"]
+    assert [state["playing"] for state in (ready, cloud, lost, played)] == [False, False, False, True]
+    assert (ready["time"], cloud["time"], cloud["shown"]) == (0, 0, "splats")
+
+
 GATE = {
     "name": "fidelity", "form": "mesh", "value": 24.6, "unit": "dB", "least": 16.5, "most": None,
     "passed": True, "meaning": "agreement with the video from the input camera: PSNR on the subject",

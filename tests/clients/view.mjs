@@ -2,8 +2,10 @@
 //
 // The one argument is a request, in JSON:
 //   {"page": file, "width": pixels, "height": pixels, "webgl2": false to have none,
+//    "reducedMotion": "reduce" for users who ask for it,
 //    "shots": [{"show": mode, "time": seconds, "file": a PNG of the canvas, with alpha}, ...],
-//    "deeds": [["press", key] or ["drag", dx, dy] or ["wheel", dy] or ["wait", seconds], ...], "screenshot": file}
+//    "deeds": [["press", key] or ["drag", dx, dy] or ["wheel", dy] or ["wait", seconds] or ["focus", selector] or
+//    ["lose"] and restore the WebGL context while paused, after which the page looks the same, ...], "screenshot": file}
 // Prints
 //   {"notice": text, "requests": addresses, "size": [width, height] of the canvas, "states": what dg4d.state() gives when
 //    the page is ready and after every deed, "drawn": digests of the picture at these moments, "video": its seconds,
@@ -13,7 +15,9 @@ import { writeFile } from "node:fs/promises";
 import { pathToFileURL } from "node:url";
 import { inBrowser } from "./browser.mjs";
 
-const { page: file, width, height, webgl2 = true, shots = [], deeds = [], screenshot } = JSON.parse(process.argv[2]);
+const request = JSON.parse(process.argv[2]);
+const { page: file, width, height, webgl2 = true, shots = [], deeds = [], screenshot } = request;
+const { reducedMotion = "no-preference" } = request;
 
 // The canvas keeps its picture only until the browser has shown it, so it is drawn anew.
 const picture = (page) => page.evaluate(() => (dg4d.draw(), document.querySelector("canvas").toDataURL("image/png")));
@@ -23,6 +27,19 @@ async function act(page, [deed, ...details]) {
   const canvas = page.locator("canvas");
   if (deed === "press") await page.keyboard.press(details[0]);
   if (deed === "wait") await page.waitForTimeout(1000 * details[0]);
+  if (deed === "focus") await page.focus(details[0]);
+  if (deed === "lose") {
+    await page.evaluate(() => dg4d.seek(0));
+    const before = await page.screenshot();
+    await page.evaluate(async () => {
+      const loss = document.querySelector("canvas").getContext("webgl2").getExtension("WEBGL_lose_context");
+      loss.loseContext();
+      await new Promise((done) => setTimeout(done, 100));
+      loss.restoreContext();
+    });
+    await page.waitForTimeout(500);
+    if (!before.equals(await page.screenshot())) throw new Error("the picture is gone with the WebGL context");
+  }
   if (deed === "wheel") await canvas.hover().then(() => page.mouse.wheel(0, details[0]));
   if (deed === "drag") {
     const box = await canvas.boundingBox();
@@ -46,6 +63,7 @@ const result = await inBrowser({}, { width, height }, async (page) => {
       };
     });
   }
+  await page.emulateMedia({ reducedMotion });
   await page.goto(pathToFileURL(file).href);
   const ready = await page.evaluate(() => dg4d.ready.then(() => true, () => false));
   const [states, drawn] = [[], []];

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,23 @@ def test_the_report_is_read_and_a_broken_one_refused(gem: Path, tmp_path: Path) 
     (folder / "report.json").write_text("{")
     with pytest.raises(BadInput, match="make the asset again"):
         _ = dg4d.load(folder).report
+
+
+def test_an_asset_whose_folder_holds_another_one_is_refused(gem: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "gem"
+    shutil.copytree(gem, folder)
+    asset, read = dg4d.load(folder), dg4d.load(folder)
+    mesh = read.mesh()
+    (folder / "asset.glb").write_bytes(b"other")
+    add_record(folder)
+    lazy: list[Callable[[], object]] = [
+        asset.mesh, asset.gaussians, asset.render, asset._repr_html_, lambda: asset.report, lambda: asset.failing,
+        lambda: asset.save_glb(tmp_path / "gem.glb"),
+    ]  # fmt: skip
+    for reading in lazy:
+        with pytest.raises(BadInput, match=r"now holds another asset.*out="):
+            reading()
+    np.testing.assert_array_equal(read.mesh().vertices, mesh.vertices)  # as it was read before
 
 
 def test_a_notebook_gets_the_viewer_in_a_frame_that_cannot_reach_the_page(gem: Path) -> None:

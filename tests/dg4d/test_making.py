@@ -207,19 +207,21 @@ def test_a_batch_of_a_folder_names_items_as_the_command_does() -> None:
 
 
 def test_conversions_in_threads_report_to_their_own_callbacks() -> None:
-    words("fox.png", "1")
-    words("cat.png", "2")
-    seen: dict[str, set[str]] = {"fox": set(), "cat": set()}
+    seen: dict[str, list[dg4d.Progress]] = {"a": [], "b": []}
+    for folder in seen:
+        Path(folder).mkdir()
+        words(f"{folder}/fox.png", f"{folder} fit_motion=sleep:0.2")
 
-    def convert(name: str) -> None:
-        dg4d.make(f"{name}.png", on_progress=lambda one: seen[name].add(one.item))
+    def convert(folder: str) -> None:
+        dg4d.make(f"{folder}/fox.png", out=f"out/{folder}", on_progress=seen[folder].append)
 
-    threads = [threading.Thread(target=convert, args=(name,)) for name in seen]
+    threads = [threading.Thread(target=convert, args=(folder,)) for folder in seen]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert seen == {"fox": {"fox"}, "cat": {"cat"}}
+    for events in seen.values():  # the assets have one name
+        assert sorted(one.step for one in events if one.kind == "finished") == sorted(EVERY_STEP)
 
 
 def test_the_engine_of_prefect_connects_and_runs_the_flow(monkeypatch: pytest.MonkeyPatch) -> None:

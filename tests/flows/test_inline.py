@@ -179,13 +179,18 @@ def test_a_version_that_cannot_be_kept_leaves_the_folder_as_it_was(
 
 
 def test_an_interrupted_conversion_keeps_its_steps_and_the_next_one_goes_on(alone: Path, tmp_path: Path) -> None:
+    ends: list[tuple[str, str]] = []
+
     def interrupt(event: StepEvent) -> None:
+        if event.kind == "failed" or event.text.startswith("interrupted after"):
+            ends.append((event.step, event.kind))
         if event.step == "fit_motion" and event.kind == "started":
             raise KeyboardInterrupt
 
     with listening(interrupt), pytest.raises(KeyboardInterrupt):
         convert_inline(job("stop", tmp_path), tmp_path / "out")
     assert not resources.stopping.is_set() and not (tmp_path / "out").exists()
+    assert ends == [("fit_motion", "note")]
     assert "fit_gaussians" in ran(alone)
     convert_inline(job("stop", tmp_path), tmp_path / "out")
     assert "fit_gaussians" not in ran(alone) and store_is_sound()

@@ -13,6 +13,7 @@ import trimesh
 from PIL import Image
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GlbReader, GltfDocument
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -177,8 +178,9 @@ def test_the_note_tells_rigid_parts_from_a_surface_that_bends() -> None:
 
 
 def test_the_package_has_the_users_own_mesh(animated: tuple[Job, dict[str, Path]], tmp_path: Path) -> None:
-    job = job_of("pack_asset", tmp_path / "pack", animated[1], notes=("a note",))
-    pack_asset.run(job)
+    settings = revise(SMALL, {"pack.height_m": 0.3, "pack.fps": 8.0})
+    job = job_of("pack_asset", tmp_path / "pack", animated[1], settings, notes=("a note",))
+    report = pack_asset.run(job)
     with zipfile.ZipFile(job.outputs["package"]) as archive:
         archive.extractall(tmp_path / "package")
     manifest = read_manifest(tmp_path / "package")
@@ -187,7 +189,15 @@ def test_the_package_has_the_users_own_mesh(animated: tuple[Job, dict[str, Path]
     assert own.model.parts[0].name == "fish"
     assert len(own.model.vertices) == len(fish().vertices)
     surface = read_surface(tmp_path / "package", manifest)
-    assert len(surface.offsets) == 3 and len(surface.mesh.faces) == len(fish().faces)
+    assert len(surface.offsets) == 5 and len(surface.mesh.faces) == len(fish().faces)
+    merged = read_glb((tmp_path / "package/asset_merged.glb").read_bytes())
+    first = (merged.mesh.vertices + merged.offsets[0]).numpy()
+    for ours, theirs in ((own.model.vertices.min(0), first.min(0)), (own.model.vertices.max(0), first.max(0))):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    assert np.ptp(own.model.vertices[:, 1]) == pytest.approx(0.3, abs=1e-4)
+    sampler = own.reader.tree["animations"][0]["samplers"][0]
+    assert own.reader.tree["accessors"][sampler["input"]]["max"] == [manifest.duration_s] == [5 / 8]
+    assert "asset.glb keeps the keys of the driving video, 5 per second, not 8" in report.notes
 
 
 ALONG, UPPER = 13, 0.4  # vertices along the arm, and half of its length

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny_judges
 import torch
+from PIL import Image
 from small_package import packed, tracked
 
 from dg4d_lib.asset_settings import ScoreSettings
@@ -254,14 +255,34 @@ def test_of_opaque_pictures_what_is_not_white_is_the_subject(package: Path, trut
 def test_frames_that_are_not_square_or_of_several_sizes_are_refused(package: Path, truth: Path, tmp_path: Path) -> None:
     odd = tmp_path / "odd"
     (odd / "input").mkdir(parents=True)
-    write_png(odd / "input" / "000.png", torch.zeros(20, 30, 4))
-    with pytest.raises(BadInput, match=r"must be square.*30 x 20"):
+    write_png(odd / "input" / "000.png", torch.zeros(40, 50, 4))
+    with pytest.raises(BadInput, match="frames of input must be square and of one size; found 50 x 40"):
         score(tmp_path / "out", odd, package)
     write_png(odd / "input" / "000.png", torch.zeros(SIZE, SIZE, 4))
     (odd / "view_15").mkdir()
     write_png(odd / "view_15" / "000.png", torch.zeros(32, 32, 4))
-    with pytest.raises(BadInput, match="as large as the input's; found 32 x 32"):
+    with pytest.raises(BadInput, match="frames of view_15 must be 64 x 64, as those of the input; found 32 x 32"):
         score(tmp_path / "out", odd, package)
+
+
+def test_frames_of_the_truth_are_turned_upright(truth: Path, tmp_path: Path) -> None:
+    for folder, turn, orientation in (("input", 0, 1), ("view_15", 90, 6)):
+        (tmp_path / "turned" / folder).mkdir(parents=True)
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        with Image.open(truth / "input" / f"{COUNT - 1:03d}.png") as picture:
+            picture.rotate(turn).save(tmp_path / "turned" / folder / "000.png", exif=exif)
+    report, _ = score(tmp_path / "out", tmp_path / "turned")
+    assert report["rows"]["input_frozen"]["mean"]["psnr"] == 60
+
+
+def test_gray_frames_keep_their_alpha(package: Path, truth: Path, tmp_path: Path) -> None:
+    (tmp_path / "gray/input").mkdir(parents=True)
+    with Image.open(truth / "input/000.png") as picture:
+        picture.convert("LA").save(tmp_path / "gray/input/000.png")
+    report, _ = score(tmp_path / "out", tmp_path / "gray", package)
+    assert report["notes"] == []
+    assert report["rows"]["asset"]["input"]["iou"] == 1
 
 
 def test_a_broken_mesh_of_the_truth_is_refused(package: Path, truth: Path, tmp_path: Path) -> None:

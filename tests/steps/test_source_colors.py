@@ -8,6 +8,7 @@ import torch
 from media_files import disc, save, save_clip
 from PIL import Image, ImageCms, PngImagePlugin
 
+from dg4d_lib.errors import BadInput
 from steps.sources.color_profiles import LARGEST_PROFILE, convert_to_srgb
 from steps.sources.reader import Source, read_source
 
@@ -59,6 +60,12 @@ def test_profiles_of_srgb_and_those_that_cannot_be_used_change_no_color(content,
 def test_a_broken_profile_of_a_picture_is_noted(tmp_path):
     Image.fromarray(disc()).convert("RGB").save(tmp_path / "a.jpg", icc_profile=b"no profile at all")
     assert any("color profile" in note for note in read(tmp_path / "a.jpg").notes)
+
+
+def test_a_tiff_with_lab_colors_is_refused_by_name(tmp_path):
+    Image.new("LAB", (40, 40), (255, 0, 0)).save(tmp_path / "a.tif")  # white, which libtiff makes yellow
+    with pytest.raises(BadInput, match="TIFF with Lab colors"):
+        read(tmp_path / "a.tif")
 
 
 def test_a_comment_with_the_name_of_a_profile_is_none(tmp_path):

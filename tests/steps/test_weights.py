@@ -1,9 +1,12 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.weights.locate import digests
 from dg4d_lib.weights.lock import LockedFile, LockEntry, write_lock
+from dg4d_lib.weights.registry import KNOWN
 from steps.contract import StepRequest
 from steps.runtime.perform import perform
 from steps.runtime.weights import (
@@ -129,3 +132,22 @@ def test_the_license_of_a_folder_is_that_of_its_card_under_its_path_and_its_stor
     copy = fill(tmp_path / "stable-zero123-copy")
     (copy / "README.md").write_text("---\nlicense: mit\n---\n")
     assert license_of(str(copy)).commercial == "no"  # a copy inherits the license of the original
+    part = fill(tmp_path / "stable-zero123" / "v1.diffusers")
+    (part / "README.md").write_text("---\nlicense: mit\n---\n")
+    stored = without_paths({"weights": str(part)})["weights"]
+    assert license_of(str(part)) == license_of(stored) == license_of("stable-zero123")
+
+
+def test_a_copy_with_published_files_has_the_license_of_the_original(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fill(tmp_path / "mine")
+    (folder / "README.md").write_text("---\nlicense: mit\n---\n")
+    (digest,) = digests(folder).values()
+    original = replace(KNOWN["stable-zero123"], published={"unet/model.safetensors": digest})
+    monkeypatch.setitem(KNOWN, original.name, original)
+    assert license_of(str(folder)) == original.license
+    locked = LockEntry(hub_id="me/mine", revision="", license="mit", files={"a": LockedFile(sha256=digest, size=0)})
+    home.mkdir()
+    write_lock(home, "me/mine", locked)
+    assert license_of("me/mine") == original.license

@@ -6,6 +6,7 @@ as eyes, are joined by bridges to their nearest neighbors and move with them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.mesh.models.sparse_map import SparseMap
 from dg4d_lib.mesh.neighbors import mesh_edges
 
 NEIGHBORS = 4  # nodes that move a point
@@ -61,10 +63,7 @@ class ControlGraph:
 
     def blend(self, values: Float[Tensor, "t m c"]) -> Float[Tensor, "t v c"]:
         """Return the weighted mean of the nodes' values at every point; its gradient is the same in every run."""
-        if not values.requires_grad:
-            return (values[:, self.indices] * self.weights[..., None]).sum(2)
-        dense = self.weights.new_zeros(len(self.weights), len(self.nodes))  # the gradient of indexing adds in any order
-        return dense.scatter_(1, self.indices, self.weights) @ values
+        return self._blending(values)
 
     def blend_rotations(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t v 4"]:
         """Return the weighted mean of the nodes' rotations at every point, unit quaternions.
@@ -82,8 +81,18 @@ class ControlGraph:
 
     def at_ends(self, values: Float[Tensor, "t m c"]) -> tuple[Float[Tensor, "t e c"], Float[Tensor, "t e c"]]:
         """Return the nodes' values at both ends of the edges; their gradient is the same in every run."""
-        eye = torch.eye(len(self.nodes), dtype=values.dtype, device=values.device)
-        return eye[self.edges[:, 0]] @ values, eye[self.edges[:, 1]] @ values
+        first, second = self._ends
+        return first(values), second(values)
+
+    @cached_property
+    def _blending(self) -> SparseMap:
+        return SparseMap(self.indices, self.weights, len(self.nodes))
+
+    @cached_property
+    def _ends(self) -> tuple[SparseMap, SparseMap]:
+        ones = self.lengths.new_ones(len(self.edges), 1)
+        first, second = (SparseMap(self.edges[:, end : end + 1], ones, len(self.nodes)) for end in (0, 1))
+        return first, second
 
 
 def build_control_graph(

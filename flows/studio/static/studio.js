@@ -542,7 +542,7 @@ function showRun(run) {
   }
   if (run.first_look) [find("#look a").href, find("#look").hidden] = [run.first_look, false];
   find("#cancel").hidden = run.has_ended || run.state === "cancelling";
-  find("#retry").hidden = !["failed", "cancelled", "crashed"].includes(run.state);
+  find("#retry").hidden = !["failed", "cancelled"].includes(run.state);
   find("#open").hidden = run.state !== "done";
   if (run.asset) find("#open").href = run.asset;
 }

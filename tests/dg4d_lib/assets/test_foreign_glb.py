@@ -10,7 +10,9 @@ from foreign_models import CORNERS, box_glb, skinned_glb
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb, write_moving_glb
 from dg4d_lib.assets.formats.foreign_joints import read_skeleton
+from dg4d_lib.assets.formats.foreign_placement import place_moving_glb
 from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.errors import BadInput
 
 MOST = 1000  # triangles
@@ -101,6 +103,23 @@ def test_morph_targets_lead_to_the_given_vertices(make):
     content, _ = write_moving_glb(glb, placement, moved, 10.0, {})
     for frame in range(3):
         np.testing.assert_allclose(played(content, frame), moved[frame], atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [box_glb, skinned_glb])
+def test_a_model_in_motion_is_placed_and_slowed_down(make):
+    glb = read_foreign_glb(make(), MOST)
+    fitted = np.diag([0.5, 0.5, 0.5, 1.0])
+    fitted[:3, 3] = (0.1, -0.2, 0.3)
+    moved = glb.model.placed(fitted).vertices + np.float32([[[0, 0, 0]], [[0, 0.25, 0]]])
+    content, _ = write_moving_glb(glb, fitted, moved, 10.0, {})
+    placed = place_moving_glb(content, Placement(2.0, (0.0, 1.0, -3.0)), 1.5)
+    for frame in range(2):
+        np.testing.assert_allclose(played(placed, frame), 2 * moved[frame] + np.float32([0, 1, -3]), atol=1e-5)
+    reader = GlbReader(placed)
+    for sampler in reader.tree["animations"][0]["samplers"]:
+        times = read_accessor(reader, sampler["input"]).ravel()
+        np.testing.assert_allclose(times, [0, 0.15, 0.3], atol=1e-6)
+        assert reader.tree["accessors"][sampler["input"]]["max"] == [times[-1]]
 
 
 def test_vertices_of_a_skin_follow_the_joints_at_rest():

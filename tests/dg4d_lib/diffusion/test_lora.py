@@ -1,4 +1,7 @@
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -44,6 +47,38 @@ def test_alpha_over_rank_scales_and_the_precision_of_the_network_stays(tmp_path:
     merge_lora(made, tmp_path / "lora.safetensors", 1.0)
     assert made["block"]["to_q"].weight.dtype == torch.bfloat16
     assert torch.equal(made["block"]["to_q"].weight.float(), 4 * UP @ DOWN)
+
+
+def save_with_metadata(folder: Path, stored: str, rank: int = 4) -> Path:
+    """A file as `save_lora_weights` of diffusers writes it; its factors have the product UP @ DOWN."""
+    down = torch.cat([DOWN, torch.zeros(rank - 1, 3)])
+    up = torch.cat([UP, torch.zeros(2, rank - 1)], dim=1)
+    tensors = {"transformer.block.to_q.lora_A.weight": down, "transformer.block.to_q.lora_B.weight": up}
+    save_file(tensors, folder / "lora.safetensors", metadata={"lora_adapter_metadata": stored, "format": "pt"})
+    return folder / "lora.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("settings", "scaling"),
+    [
+        ({"lora_alpha": 8, "r": 4}, 2.0),
+        ({"lora_alpha": 8, "use_rslora": True}, 8 / math.sqrt(4)),
+        ({"lora_alpha": 8, "alpha_pattern": {"to_k": 1, "block.to_q": 2}}, 0.5),
+        ({"lora_alpha": 8, "alpha_pattern": {"to_(q|v)": 16}}, 4.0),
+        ({"target_modules": ["to_q"]}, 1.0),
+    ],
+)
+def test_alpha_in_the_metadata_scales_a_lora(settings: dict[str, Any], scaling: float, tmp_path: Path) -> None:
+    stored = json.dumps({f"transformer.{key}": value for key, value in settings.items()})
+    made = network()
+    merge_lora(made, save_with_metadata(tmp_path, stored), 1.0)
+    assert torch.equal(made["block"]["to_q"].weight, scaling * UP @ DOWN)
+
+
+@pytest.mark.parametrize("stored", ["{", "[]", '{"lora_alpha": "much"}', '{"alpha_pattern": {"(": 1}}'])
+def test_metadata_that_cannot_be_read_is_refused(stored: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"lora_adapter_metadata in .* cannot be read"):
+        merge_lora(network(), save_with_metadata(tmp_path, stored), 1.0)
 
 
 @pytest.mark.parametrize(

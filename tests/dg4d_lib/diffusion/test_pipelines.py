@@ -1,18 +1,23 @@
-"""Offloading by memory budgets, with networks of the published sizes on the meta device; detection of flow matching."""
+"""Loading, offloading by memory budgets (networks of the published sizes, on the meta device), arguments of calls."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
+from tiny_text_to_image import save_pipeline
 from torch import nn
 
 from dg4d_lib.diffusion.pipelines import (
     GIB,
     WORKSPACE_GB,
     choose_offload,
+    guidance_arguments,
     is_flow_matching,
     load_pipeline,
     peak_gib,
@@ -138,3 +143,54 @@ def test_a_class_that_diffusers_lacks_is_named(tmp_path: Path) -> None:
     (tmp_path / "model_index.json").write_text("[]")
     with pytest.raises(BadInput, match="names no pipeline"):
         pipeline_class_name(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_pipeline(tmp_path_factory.mktemp("models") / "tiny")
+
+
+@pytest.mark.parametrize(
+    ("file", "part"),
+    [("text_encoder/model.safetensors", "mlp.fc1"), ("vae/diffusion_pytorch_model.safetensors", "decoder.conv_in")],
+)
+def test_missing_tensors_are_refused(file: str, part: str, tiny: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(tiny, tmp_path / "broken")
+    kept = {name: value for name, value in load_file(broken / file).items() if part not in name}
+    save_file(kept, broken / file, {"format": "pt"})
+    with pytest.raises(BadInput, match=rf"does not match its config\.json: 2 tensors are missing .*{part}\.bias"):
+        load_pipeline(broken, torch.float32)
+
+
+def test_files_in_half_precision_are_read_where_it_is_requested_or_there_are_no_others(
+    tiny: Path, tmp_path: Path
+) -> None:
+    both = shutil.copytree(tiny, tmp_path / "both")
+    for file in both.glob("*/*.safetensors"):
+        half = {name: torch.full_like(value, 0.5).half() for name, value in load_file(file).items()}
+        save_file(half, file.with_name(f"{file.stem}.fp16.safetensors"), {"format": "pt"})
+    (both / "vae" / "diffusion_pytorch_model.safetensors").unlink()
+    full, half = load_pipeline(both, torch.float32), load_pipeline(both, torch.float16)
+    weights = [part.parameters() for part in (full.unet, full.text_encoder, full.vae, half.unet, half.text_encoder)]
+    assert [all(bool((value == 0.5).all()) for value in part) for part in weights] == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("default", "distilled", "expected"),
+    [
+        (4.0, False, {"true_cfg_scale": 7.0, "negative_prompt": " "}),
+        (4.0, True, {"guidance_scale": 7.0}),
+        (1.0, False, {"guidance_scale": 7.0}),
+    ],
+)
+def test_guidance_has_the_name_that_has_an_effect(default: float, distilled: bool, expected: dict[str, Any]) -> None:
+    class Pipeline:
+        def __init__(self) -> None:
+            network = nn.Identity()
+            network.config = SimpleNamespace(guidance_embeds=distilled)
+            self.components = {"transformer": network}
+
+        def __call__(self, prompt: str, true_cfg_scale: float = default, guidance_scale: float | None = None) -> None:
+            raise NotImplementedError
+
+    assert guidance_arguments(Pipeline(), 7.0) == expected

@@ -3,8 +3,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from tiny_qwen_edit import save_tiny_qwen_image
 from tiny_text_to_image import save_pipeline
 
+from dg4d_lib.diffusion.flop_counter import count_flops
 from dg4d_lib.diffusion.text_to_image import draw_picture
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.input_settings import TextSettings
@@ -37,6 +39,26 @@ def test_equal_words_and_seeds_give_equal_pictures_and_others_do_not(model: Path
         draw(model, guidance_scale=1.0),
     ):
         assert not torch.equal(picture, other)
+
+
+def test_a_vae_that_keeps_state_and_true_guidance_are_taken(tmp_path: Path) -> None:
+    model = save_tiny_qwen_image(tmp_path)
+    plain = draw(model, size=32)
+    with count_flops() as flops:
+        assert torch.equal(draw(model, size=32), plain)
+    assert flops["QwenImageTransformer2DModel"] > 1e4
+    assert not torch.equal(draw(model, size=32, guidance_scale=20.0), plain)
+
+
+def test_what_the_pipeline_refuses_is_bad_input(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from diffusers import StableDiffusionPipeline
+
+    def refuse(*given: object, **named: object) -> None:
+        raise ValueError("`height` and `width` have to be divisible by 16")
+
+    monkeypatch.setattr(StableDiffusionPipeline, "check_inputs", refuse)
+    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* refused its input: .* divisible by 16"):
+        draw(model)
 
 
 def test_the_suffix_is_part_of_the_words(model: Path) -> None:

@@ -186,6 +186,12 @@ def test_the_one_token_is_not_attended_to_at_length(model: VideoModel) -> None:
     assert any("temporal_transformer_blocks" in name for name in shortened)
 
 
+def test_images_that_are_not_finite_are_refused(model: VideoModel) -> None:
+    latents = torch.full(model.latent_shape(1, 2, SIDE, SIDE)[1:], torch.nan)
+    with pytest.raises(BadInput, match=r"overflowed.*driving\.model\.precision=bf16.*refiner\.model\.precision"):
+        model.decode(latents)
+
+
 def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "unet").symlink_to(folder / "unet")
     with pytest.raises(BadInput, match="vae"):

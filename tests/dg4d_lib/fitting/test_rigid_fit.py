@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.asset_fit import AssetFit
-from dg4d_lib.fitting.losses import pyramid_error, pyramid_residuals
+from dg4d_lib.fitting.losses import LEVELS, pyramid_error, pyramid_residuals
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.fitting.rigid_fit import _Problem, fit_rigid_motion
 from dg4d_lib.fitting.rigid_parts import RigidMotion
@@ -84,6 +85,19 @@ def test_squares_of_the_residuals_are_the_losses_without_those_in_depth(fit: Ass
     losses = flat.losses(motion, frames)
     squares = fit.residuals(motion, frames).square().sum(1).mean()
     assert float(squares) == pytest.approx(float(losses["color"] + losses["alpha"] + losses["unseen"]), rel=1e-4)
+
+
+def test_filters_of_the_pyramid_are_means_over_squares() -> None:
+    generator = torch.Generator().manual_seed(0)
+    ours, theirs = torch.rand(2, 2, 48, 41, 3, generator=generator)
+    levels = [(ours - theirs).movedim(-1, 1)]
+    for width in LEVELS[1:]:
+        filtered = functional.avg_pool2d(levels[0], width // 2)
+        for _ in range(3):
+            filtered = functional.avg_pool2d(filtered, 3, 1, 1)
+        levels.append(filtered)
+    expected = torch.stack([level.square().mean() for level in levels]).mean()
+    torch.testing.assert_close(pyramid_error(ours, theirs), expected)
 
 
 def test_squares_of_the_pyramid_sum_to_its_error() -> None:

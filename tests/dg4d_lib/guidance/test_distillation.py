@@ -94,6 +94,18 @@ def test_pieces_have_the_loss_and_the_gradient_of_the_whole(size: int):
     torch.testing.assert_close(pieces.grad, whole.grad)
 
 
+@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize("broken", [1, 2])
+def test_the_loss_is_not_a_number_if_no_predicted_noise_is(broken: int, size: int):
+    def predict(noisy: torch.Tensor, t: int, piece: slice) -> torch.Tensor:
+        return torch.tensor([torch.nan] * broken + [0.5] * (2 - broken))[piece, None, None, None].expand_as(noisy)
+
+    images, noise = torch.rand(2, 4, 4, 3), torch.ones(2, 3, 4, 4)
+    batches = MicroBatches("images", size)
+    loss = distill_in_pieces(images, lambda pixels: pixels.movedim(-1, 1), predict, 500, noise, batches)
+    assert bool(loss.isnan()) == (broken == 2)
+
+
 @pytest.mark.parametrize("timestep", [20, 500, 980])
 def test_the_gradient_is_the_weighted_difference_of_noises(timestep: int):
     latents = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0), requires_grad=True)

@@ -168,6 +168,22 @@ def test_text_is_heard(model: ImageDream) -> None:
     assert not torch.equal(model.predict_noise(noisy(1), 300, [ring()], told, 5.0), noise)
 
 
+def test_many_frames_are_encoded_a_few_at_a_time(model: ImageDream, monkeypatch: pytest.MonkeyPatch) -> None:
+    encode, sizes = model.vae.encode, []
+
+    def tight(pixels: torch.Tensor) -> object:
+        sizes.append(len(pixels))
+        if len(pixels) > 2:
+            raise torch.OutOfMemoryError("no room")
+        return encode(pixels)
+
+    monkeypatch.setattr(model.vae, "encode", tight)
+    every, last = model.conditioned_on(pictures(5)), model.conditioned_on(pictures(5)[4:])
+    assert sizes == [4, 2, 2, 1, 1] and len(every.image_latents) == len(every.prompt_embeds) == 5
+    torch.testing.assert_close(every.image_latents[4:], last.image_latents)
+    torch.testing.assert_close(every.image_embeds[4:], last.image_embeds)
+
+
 def views_of(rings: Sequence[Sequence[OrbitCamera]], frames: Sequence[int]) -> list[GuidanceView]:
     return [
         GuidanceView(dataclasses.replace(camera, width=48, height=48), frame)

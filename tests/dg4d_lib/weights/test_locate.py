@@ -129,6 +129,23 @@ def test_without_a_lock_missing_parts_tensors_and_shards_are_told(tmp_path: Path
     assert "has no tensors" in find_problems(tmp_path / "empty", KNOWN["lgm"])["empty"]
 
 
+def test_without_a_lock_absent_folders_of_a_pipeline_are_told(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "imagedream", ("vae",))
+    index = {"_class_name": ["mvdream", "MVDreamPipeline"], "vae": ["diffusers", "A"], "unet": ["mvdream", "B"]}
+    (folder / "model_index.json").write_text(json.dumps({**index, "safety_checker": [None, None]}))
+    assert find_problems(folder, KNOWN["imagedream"]) == {"unet": "is missing"}
+
+
+@pytest.mark.parametrize("name", ["model_index.json", "unet/model.safetensors.index.json"])
+@pytest.mark.parametrize("text", ['{"metadata": {"tot', "[]"])
+def test_a_list_of_files_that_cannot_be_read_is_told(name: str, text: str, home: Path) -> None:
+    folder = fill(home / "imagedream")
+    (folder / name).write_text(text)
+    assert find_problems(folder, KNOWN["imagedream"]) == {name: "cannot be read"}
+    with pytest.raises(BackendUnavailable, match=f"{name} cannot be read; .*`dg4d weights pull imagedream`"):
+        find_weights("imagedream", home)
+
+
 def test_the_hub_cache_is_used_as_other_programs_left_it(no_hub_cache: Path, home: Path) -> None:
     repository = no_hub_cache / "models--stabilityai--stable-video-diffusion-img2vid"
     snapshot = fill(repository / "snapshots" / "abc")

@@ -44,6 +44,7 @@ class Hub:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.files = dict(REPOSITORY)
         self.fails: Exception | None = None
+        self.breaks_after: int | None = None
         self.revisions: list[str | None] = []
         self.downloaded: list[str] = []
         self.newest = "a" * 40
@@ -77,6 +78,8 @@ class Hub:
                 (local_dir / name).parent.mkdir(parents=True, exist_ok=True)
                 (local_dir / name).write_bytes(self.files[name])
                 self.downloaded.append(name)
+                if len(self.downloaded) == self.breaks_after:
+                    raise ConnectionError("lost")
 
 
 @pytest.fixture
@@ -130,6 +133,27 @@ def test_a_pull_goes_on_and_mends_what_is_damaged(hub: Hub, tmp_path: Path) -> N
     pull(SVD, tmp_path)
     assert hub.downloaded == ["unet/model.fp16.safetensors", "vae/config.json"]
     find_weights("svd", tmp_path)
+
+
+def test_a_pull_that_broke_off_is_not_complete_until_it_is_repeated(hub: Hub, tmp_path: Path) -> None:
+    pictures = lookup_weights("somebody/pictures")
+    hub.breaks_after = 4
+    with pytest.raises(BackendUnavailable, match="connect this machine to the network"):
+        pull(pictures, tmp_path)
+    assert len(hub.downloaded) == 4
+    with pytest.raises(BackendUnavailable, match=r"has unfinished files; .*`dg4d weights pull somebody/pictures`"):
+        find_weights("somebody/pictures", tmp_path)
+    hub.breaks_after = None
+    pull(pictures, tmp_path)
+    (tmp_path / "weights.lock.json").unlink()
+    find_weights("somebody/pictures", tmp_path)
+
+
+def test_a_list_of_files_that_cannot_be_read_is_downloaded_again(hub: Hub, tmp_path: Path) -> None:
+    (tmp_path / "somebody--pictures").mkdir()
+    (tmp_path / "somebody--pictures/model_index.json").write_bytes(b'{"vae": [')
+    pull(lookup_weights("somebody/pictures"), tmp_path)
+    assert "model_index.json" in hub.downloaded
 
 
 def test_a_download_that_is_not_what_the_hub_lists_is_refused(hub: Hub, tmp_path: Path) -> None:

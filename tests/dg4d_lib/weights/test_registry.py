@@ -45,8 +45,34 @@ def test_a_model_card_does_not_change_what_is_known() -> None:
     assert lookup_weights("stable-zero123", "mit").license.commercial == "no"
 
 
-def test_a_copy_is_no_freer_than_what_it_is_a_copy_of() -> None:
-    copied = lookup_weights("Somebody/Stable-Zero123-diffusers", "mit")
-    assert copied.license == KNOWN["stable-zero123"].license
-    assert copied.hub_id == "Somebody/Stable-Zero123-diffusers"
-    assert lookup_weights("somebody/zero123", "mit").license.commercial == "yes"
+@pytest.mark.parametrize(
+    ("copy", "original"),
+    [
+        ("Somebody/Stable-Zero123-diffusers", "stable-zero123"),
+        ("/models/stable_zero123/diffusers", "stable-zero123"),
+        ("/models/zero123-xl", "zero123-xl"),
+        ("somebody/svd", "svd"),
+        ("somebody/stable-video-diffusion-img2vid", "svd"),
+    ],
+)
+def test_a_copy_is_no_freer_than_what_it_is_a_copy_of(copy: str, original: str) -> None:
+    copied = lookup_weights(copy, "mit")
+    assert copied.license == KNOWN[original].license
+    assert copied.hub_id == copy
+
+
+def test_a_name_or_a_file_frees_no_weights_and_a_name_counts_as_whole_words() -> None:
+    assert lookup_weights("somebody/lgm", "cc-by-nc-4.0").license.commercial == "no"
+    assert lookup_weights("somebody/lgm").license.commercial == "unverified"
+    vgg16 = set(KNOWN["vgg16"].published.values())
+    assert lookup_weights("somebody/else", "cc-by-nc-4.0", vgg16).license.commercial == "no"
+    for other in ("somebody/zero123", "somebody/svdquant", "somebody/Hi3D"):
+        assert lookup_weights(other, "mit").license.name == "mit"
+
+
+def test_a_copy_is_known_by_its_files_whatever_its_name() -> None:
+    published = KNOWN["stable-zero123"].published
+    unet = published["unet/diffusion_pytorch_model.safetensors"]
+    assert lookup_weights("somebody/views", "mit", {unet}).license == KNOWN["stable-zero123"].license
+    shared = published["vae/diffusion_pytorch_model.safetensors"]
+    assert lookup_weights("somebody/views", "mit", {shared}).license.name == "mit"

@@ -6,14 +6,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
+import typer
 from prefect.settings import PREFECT_API_URL
 from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
-from flows.serving import workers
+from flows import convert
+from flows.commands import services
+from flows.serving import background, watching, workers
 from flows.serving.server import Server
 from flows.serving.workers import running
+from flows.ui import showing
 
 
 @pytest.fixture
@@ -132,3 +137,46 @@ def test_other_programs_get_address_and_secret_of_a_server_that_runs(
     ]
     monkeypatch.setenv("DG4D_HOME", str(tmp_path))
     assert dg4d("env").returncode == 69
+
+
+def test_a_command_uses_the_server_that_it_connected_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING", "PREFECT_HOME"):
+        monkeypatch.setenv(name, "")  # to have it restored
+        monkeypatch.delenv(name)
+    used: dict[Path, Server] = {}
+    monkeypatch.setattr(background, "_used", used)
+    monkeypatch.setattr("flows.serving.server.spawn_guard", lambda *_: None)
+    monkeypatch.setattr(Server, "wait_for_address", lambda _: "http://127.0.0.1:1")
+    monkeypatch.setattr(Server, "wait", lambda _: "http://127.0.0.1:1/api")
+    monkeypatch.setattr("flows.engine.orphans.settle_orphans", lambda: 0)
+    convert.connect()
+    assert background.background_server().is_used()
+    used[tmp_path / "server"].release()
+    assert not background.background_server().is_used()
+
+
+def test_a_watch_goes_on_while_the_server_is_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "fox.png").write_bytes(b"picture")
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(services, "POLL_S", 0.0)
+    monkeypatch.setattr(convert, "connect", lambda: None)
+    monkeypatch.setattr(watching, "check_registered", lambda: None)
+    happened: list[str] = []
+
+    def announce(folder: Path, out: Path, digest: str) -> None:
+        happened.append(digest)
+        if len(happened) < 5:
+            raise httpx.ConnectError("away")
+
+    monkeypatch.setattr(watching, "announce", announce)
+    monkeypatch.setattr(showing, "revive", lambda: happened.append("revived"))
+    monkeypatch.setattr(watching.Watcher, "told", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(typer.Exit):
+        services.watch(tmp_path / "in", tmp_path / "out", 0.0)
+    digest = happened[0]
+    assert happened == [digest, "revived", digest, "revived", digest]
+    assert capsys.readouterr().err.count("the server does not answer") == 1

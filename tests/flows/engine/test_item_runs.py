@@ -1,5 +1,6 @@
 """Runs of items by a deployment: begun once, found again, given up; what travels through the store."""
 
+import pickle
 import threading
 import time
 from collections.abc import Iterator
@@ -31,7 +32,17 @@ from flows.packages.delivery import Outcome, pack_package, read_outcome, remove_
 from flows.serving import registering
 from flows.serving.pools import read_pools
 from flows.serving.server import Server
-from flows.step_errors import StepBadInput, StepOutOfMemory
+from flows.step_errors import (
+    StepBadInput,
+    StepCrashed,
+    StepDiverged,
+    StepError,
+    StepLost,
+    StepMissing,
+    StepOutOfMemory,
+    StepTimedOut,
+    StepUnreachable,
+)
 from steps.contract import ArtifactRef
 from steps.profiles import PREVIEW
 
@@ -210,3 +221,18 @@ def test_what_travelled_a_day_ago_is_forgotten(job: ConversionJob, monkeypatch: 
     monkeypatch.setattr(type(store), "now", lambda self: tomorrow)
     remove_expired(store)
     assert read_outcome(store, "old") is None
+
+
+@pytest.mark.parametrize("kind", [StepError, StepBadInput, StepMissing, StepLost, StepUnreachable, StepDiverged,
+                                  StepOutOfMemory, StepTimedOut, StepCrashed])  # fmt: skip
+def test_the_failure_of_a_step_passes_between_processes(kind: type[StepError]) -> None:
+    picture = ArtifactRef(digest=f"sha256:{'0' * 64}", media_type="image/png", size_bytes=1)
+    found = pickle.loads(pickle.dumps(kind("fit_motion", "no", {"last": picture})))
+    assert type(found) is kind and str(found) == "fit_motion: no"
+    assert (found.step, found.message, found.pictures) == ("fit_motion", "no", {"last": picture})
+
+
+def test_the_failure_of_an_item_passes_between_processes() -> None:
+    outcome = Outcome(kind="StepBadInput", message="no", step="fit_motion")
+    found = pickle.loads(pickle.dumps(ItemFailed(outcome)))
+    assert (type(found), str(found), found.outcome, found.step) == (ItemFailed, "no", outcome, "fit_motion")

@@ -7,6 +7,7 @@ import pytest
 
 from flows.engine.events import StepEvent
 from flows.engine.schedule import USUAL_S, Schedule, durations_file, format_left, keep_durations, load_durations
+from flows.tasks import TASKS
 
 STEPS = ["prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh"]
 
@@ -41,6 +42,28 @@ def test_a_machine_of_half_the_speed_needs_twice_the_time() -> None:
         run(schedule, step, clock, clock + 2 * USUAL_S[step])
         clock += 2 * USUAL_S[step]
     assert schedule.seconds_left(clock) == pytest.approx(2 * rest)
+
+
+def test_every_step_of_a_conversion_has_a_usual_duration() -> None:
+    assert vars(TASKS).keys() - {"finished"} <= USUAL_S.keys()
+
+
+def test_an_earlier_conversion_of_a_model_predicts_the_next() -> None:
+    earlier = {"prepare_asset": 5.5, "drive_video": 0.9, "animate_asset": 97.0, "pack_asset": 11.0, "check_asset": 1.8}
+    assert Schedule([*earlier], earlier).seconds_left(0.0) == pytest.approx(sum(earlier.values()))
+
+
+@pytest.mark.parametrize("earlier", [None, {name: USUAL_S[name] for name in STEPS}])
+def test_a_long_preparation_does_not_multiply_the_other_steps(earlier: dict[str, float] | None) -> None:
+    schedule, rest = Schedule(STEPS, earlier), sum(USUAL_S[name] for name in STEPS[3:])
+    schedule.note(event("prepare_subject", "progress", done=0, total=3), 0.0)
+    schedule.note(event("prepare_subject", "progress", done=2, total=3), 40.0)
+    left = schedule.seconds_left(40.0)
+    assert left is None if earlier is None else left == pytest.approx(20 + sum(USUAL_S[name] for name in STEPS[1:]))
+    run(schedule, "prepare_subject", 0.0, 60.0)
+    run(schedule, "drive_video", 60.0, 61.0)
+    run(schedule, "fit_gaussians", 61.0, 71.0)
+    assert schedule.seconds_left(71.0) == pytest.approx(rest)
 
 
 def test_a_running_step_is_predicted_by_its_own_pace() -> None:

@@ -123,6 +123,14 @@ def test_a_bad_line_of_csv_fails_its_row_alone(tmp_path: Path, line: bytes, says
     assert says in error and error.startswith("row 2: ")
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_a_manifest_in_utf_16_is_refused_with_the_remedy(tmp_path: Path, kind: str, encoding: str) -> None:
+    (tmp_path / f"m.{kind}").write_text("\ufeffpath\na.png\n", encoding)
+    with pytest.raises(BadInput, match="save the manifest as UTF-8"):
+        items(tmp_path / f"m.{kind}")
+
+
 def test_line_breaks_in_quotes_belong_to_their_cell(tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text('path,text,text.weights\n,"a red\nfox\x0band more",some/pictures\nb.png,,\n')
     fox, b = items(tmp_path / "m.csv")

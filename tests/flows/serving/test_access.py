@@ -5,6 +5,7 @@ import stat
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from prefect.client.orchestration import get_client
@@ -177,6 +178,8 @@ def test_a_browser_that_is_not_signed_in_is_sent_to_the_page_that_signs_in(
     path = address_of(artifact)
     status, headers, _ = ask(server, path, Sec_Fetch_Dest="document", Sec_Fetch_Site="same-origin")
     assert (status, headers["location"]) == (303, f"/dg4d/login?next={path}")
+    _, headers, _ = ask(server, f"{path}?page=2&search=a%26b", Sec_Fetch_Dest="document")
+    assert parse_qs(urlsplit(headers["location"]).query) == {"next": [f"{path}?page=2&search=a%26b"]}
     status, headers, page = ask(server, "/dg4d/login")
     nonce = headers["content-security-policy"].partition("'nonce-")[2].partition("'")[0]
     assert status == 200 and page.count(nonce.encode()) == 2 and b"NONCE" not in page

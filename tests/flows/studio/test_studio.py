@@ -1,7 +1,10 @@
 """The studio: its routes, its pages in Chromium, and a restart of its server; one server and one worker for all."""
 
+import asyncio
+import hashlib
 import json
 import re
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
@@ -10,13 +13,18 @@ from typing import Any
 import pytest
 from fake_steps import PNG, picture
 from PIL import Image
+from starlette.requests import Request
 from waiting import wait_until
 
 from flows import home
 from flows.engine.versions import Version, VersionStep
 from flows.serving.auth import Sessions, basic
 from flows.serving.workers import Worker, running
-from steps.contract import digest_of
+from flows.studio import gallery
+from flows.studio.changes import Changes
+from flows.studio.drafts import Draft
+from flows.studio.server_api import TAG, ServerApi
+from steps.contract import ArtifactRef, digest_of
 from tests.clients.node import run_node
 from tests.flows.studio.conftest import Client
 
@@ -69,6 +77,23 @@ def test_the_page_runs_its_own_script_alone_and_is_not_framed(studio: Client) ->
 def test_an_address_of_nothing_is_not_found(studio: Client, path: str) -> None:
     status, content = studio.read(path)
     assert status == 404 and b"Traceback" not in content
+
+
+def test_a_player_gets_ranges_of_a_film_inside_a_zip(studio: Client) -> None:
+    content = BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("films/1.mp4", bytes(range(100)))
+        archive.writestr("../out.mp4", b"x")
+    ref = home.store().put_bytes(content.getvalue(), "application/zip")
+    folder = f"/entries/{ref.digest.removeprefix('sha256:')}/{ref.size_bytes}"
+    for _ in range(2):
+        status, headers, part = studio.ask(f"{folder}/films/1.mp4", Range="bytes=10-19", **studio.secret)
+        assert (status, headers["content-range"], part) == (206, "bytes 10-19/100", bytes(range(10, 20)))
+    status, headers, nothing = studio.ask(f"{folder}/films/1.mp4", "HEAD", **studio.secret)
+    assert (status, headers["content-length"], headers["content-type"], nothing) == (200, "100", "video/mp4", b"")
+    assert headers["content-disposition"] == 'inline; filename="1.mp4"'
+    assert studio.ask("", "HEAD", **studio.secret)[0] == 200
+    assert {studio.read(f"{folder}/{name}")[0] for name in ("films", "films/", "films/2.mp4", "..%2Fout.mp4")} == {404}
 
 
 @pytest.mark.parametrize("path", ["/drafts/0123456789abcdef/files?name=x", f"/runs/{UNKNOWN}/cancel",
@@ -202,6 +227,47 @@ def test_a_conversion_is_cancelled(studio: Client) -> None:
     for run in (begun, waiting):
         assert studio.ended(run)["state"] == "cancelled"
         assert studio.post(f"/runs/{run}/cancel")[0] == 200  # a second tab
+
+
+def test_a_crashed_conversion_is_cancelled_and_not_started_a_second_time(studio: Client) -> None:
+    flow = studio.post("/api/flows/", {"name": "killed"})[1]["id"]
+    wanted = {"flow_id": flow, "name": "killed", "tags": [TAG], "state": {"type": "CRASHED", "name": "Crashed"}}
+    run = studio.post("/api/flow_runs/", wanted)[1]["id"]
+    page = studio.read("/activity")[1].decode()
+    assert f"/runs/{run}/cancel" in page and f"/runs/{run}/retry" not in page
+    assert studio.post(f"/runs/{run}/retry")[0] == 409
+    assert studio.post(f"/runs/{run}/cancel")[0] == 200
+    assert studio.ended(run)["state"] == "cancelled"
+
+
+def test_an_upload_that_the_browser_ends_leaves_nothing_and_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    draft = Draft.create().identifier
+
+    async def receive() -> dict[str, str]:
+        return {"type": "http.disconnect"}
+
+    scope = {"type": "http", "method": "POST", "headers": [], "query_string": b"name=fox.png"}
+    request = Request({**scope, "path_params": {"identifier": draft}}, receive)
+    answer = asyncio.run(Changes(ServerApi(request, "dg4d:secret")).upload(request))
+    assert (answer.status_code, answer.body) == (499, b"")
+    assert list((home.uploads() / draft / "files").iterdir()) == []
+
+
+def test_an_artifact_that_was_missing_is_looked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    content = b'{"accepted": true}'
+    digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
+    step = VersionStep(label="check_asset", record=digest, inputs={}, outputs={"gates": digest})
+    source = ArtifactRef(digest=digest, media_type="application/json", size_bytes=len(content))
+    version = Version(
+        item="fox", order=digest, package=source, profile="preview", seed=0, source=source, finished="", steps=(step,)
+    )
+    assert gallery._output(version, "check_asset", "gates") is None
+    home.store().put_bytes(content, "application/json")
+    assert gallery._output(version, "check_asset", "gates") == {"accepted": True}
 
 
 def test_a_folder_becomes_a_batch(studio: Client) -> None:

@@ -12,10 +12,12 @@ from PIL import Image
 
 from flows import home
 from flows.inputs.manifest import items_of
+from flows.inputs.naming import name_from_path
 from flows.serving.roots import Roots
 from flows.studio import quick
 from flows.studio.drafts import Draft, Upload
 from flows.studio.pages import DESCRIPTIONS
+from flows.studio.status import name_of
 from flows.studio.submission import Submission, convert
 from steps.profiles import PROFILES
 
@@ -55,6 +57,14 @@ def test_a_batch_makes_an_asset_of_every_file_whatever_its_suffix(draft: Draft) 
         roots.check_item(item)
         assert item.request is not None
         item.request.check()
+
+
+@pytest.mark.parametrize("file", ["fox.png", "picture", "Fox 1.5"])
+def test_a_name_with_dots_stays_whole(draft: Draft, file: str) -> None:
+    receive(draft, file, PNG)
+    run = convert(draft, Submission(name="Fox 1.5"))
+    row = {"name": run.name, "parameters": run.parameters}
+    assert name_of(row) == name_from_path(Path(run.parameters["picture"])) == "Fox 1.5"
 
 
 @pytest.mark.parametrize(("frames", "kind"), [(1, "picture"), (2, "video")])

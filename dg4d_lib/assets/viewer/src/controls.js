@@ -4,6 +4,7 @@ import { SPEEDS } from "./player.js";
 const VIDEO_DRIFT = 0.12; // seconds; larger offsets of the video are corrected by seeking
 const TURN = Math.PI / 24; // of the camera, per key press
 const ZOOM = 1.1; // of its distance, per key press
+export const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const byId = (id) => document.getElementById(id);
 
 export class Controls {
@@ -75,11 +76,12 @@ export class Controls {
   unfold(open = document.body.hasAttribute("data-folded")) {
     document.body.toggleAttribute("data-folded", !open);
     byId("details").setAttribute("aria-expanded", open);
-    if (open) byId("panel").scrollIntoView({ behavior: "smooth", block: "nearest" });
+    if (open) byId("panel").scrollIntoView({ behavior: reducedMotion ? "auto" : "smooth", block: "nearest" });
   }
 
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select, summary")) return;
+    if (event.key === " " && event.target.closest("button")) return; // the browser presses the button
     const { player } = this;
     const deeds = {
       " ": () => this.toggle(),

@@ -1,7 +1,7 @@
 // Entry point: connects embedded data, stage, clock and controls. `window.dg4d` is the scripting interface.
 import { bytesOf, camera, facts } from "./embedded.js";
 import { Cloud } from "./cloud.js";
-import { Controls } from "./controls.js";
+import { Controls, reducedMotion } from "./controls.js";
 import { readMesh } from "./mesh.js";
 import { Player } from "./player.js";
 import { fillPanel } from "./panel.js";
@@ -27,7 +27,7 @@ async function start() {
   if (!canDraw()) throw new Error(NO_WEBGL);
   const { mesh, cloud } = await read();
   const player = new Player(Math.max(mesh?.duration ?? 0, cloud?.splats.duration ?? 0), cloud?.splats.fps || mesh?.fps || 1);
-  player.playing = player.frames > 1;
+  player.playing = player.frames > 1 && !reducedMotion;
   const stage = new Stage(stageElement, camera());
   const modes = [...(mesh ? ["mesh"] : []), ...(cloud ? ["splats"] : []), ...(mesh ? ["wireframe"] : [])];
   const shown = [mesh, cloud].filter(Boolean);

@@ -29,6 +29,7 @@ export class Stage {
     Object.assign(this.controls, { enableDamping: true, minDistance: NEAREST, maxDistance: FARTHEST });
     this.stale = true;
     this.controls.addEventListener("change", () => (this.stale = true));
+    this.renderer.domElement.addEventListener("webglcontextrestored", () => (this.stale = true));
     new ResizeObserver(() => this.resize()).observe(element);
     this.light();
     this.reset();
