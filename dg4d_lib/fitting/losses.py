@@ -17,7 +17,7 @@ from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.rasterizer.interface import Rendering
 
 WHITE = (1.0, 1.0, 1.0)
-LEVELS = (1, 4, 8)  # widths of the filters over pictures that a pyramid compares, pixels
+LEVELS = (1, 4, 8)  # widths of the filters over pictures that a pyramid compares, pixels; 1: none
 
 
 def resize_cutouts(
@@ -113,17 +113,17 @@ class Diverged(FitDiverged):
 
 def _pyramid(difference: Float[Tensor, "b h w c"]) -> list[Float[Tensor, "b c _ _"]]:
     planes = difference.movedim(-1, 1)
-    height, width = planes.shape[-2:]
-    return [
-        planes if level == 1 else _filter(height, level).to(planes) @ planes @ _filter(width, level).to(planes).mT
-        for level in LEVELS
-    ]
+    levels = [planes]
+    for width in LEVELS[1:]:
+        rows, columns = (_filter(size, width, planes.dtype, planes.device) for size in planes.shape[-2:])
+        levels.append(rows @ planes @ columns.mT)
+    return levels
 
 
 @cache
-def _filter(size: int, width: int) -> Float[Tensor, "_ {size}"]:
+def _filter(size: int, width: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "_ {size}"]:
     """Return a level's filter along one axis as a matrix: a fourth of the time of avg_pool2d, which it equals."""
     filtered = functional.avg_pool1d(torch.eye(size, dtype=torch.float64)[None], width // 2)
     for _ in range(3):
         filtered = functional.avg_pool1d(filtered, 3, 1, 1)
-    return filtered[0].T.float()
+    return filtered[0].T.to(device, dtype)

@@ -155,7 +155,7 @@ FILES: dict[str, Accepted | Refused] = {
     "tiff: a directory that follows itself": PICTURE,
     "tiff: three pages": PICTURE,
     "tiff: CMYK": PICTURE,
-    "tiff: Lab": PICTURE,
+    "tiff: Lab": Refused("with Lab colors"),
     "tiff: 1 bit, fax": PICTURE,
     "tiff: 16 bits": PICTURE,
     "tiff: 32 bits": PICTURE,

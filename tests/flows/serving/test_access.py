@@ -158,6 +158,8 @@ def test_an_artifact_needs_the_secret_or_a_session_of_our_own_page(server: Serve
     assert ask(server, path.replace("artifacts", "viewer"))[0] == 401
     assert ask(server, path, Authorization=basic("dg4d:guess"))[0] == 401
     assert ask(server, path, Authorization=basic(server.auth_string()))[2] == PNG
+    status, headers, _ = ask(server, path, "HEAD", Authorization=basic(server.auth_string()))
+    assert (status, headers["content-length"]) == (200, str(len(PNG)))
     assert ask(server, "/dg4d/session")[0] == 401
     status, headers, _ = ask(server, "/dg4d/session", Authorization=basic(server.auth_string()))
     set_cookie = next(value for name, value in headers.items() if name.lower() == "set-cookie")
