@@ -210,10 +210,11 @@ def _load_networks(model: Path, dtype: torch.dtype, wanted: Callable[[str], bool
     for name, entry in json.loads((model / INDEX).read_text(encoding="utf-8")).items():
         match entry:
             case ["diffusers" | "transformers" as library, str(class_name)] if wanted(name):
-                cls = getattr(import_module(library), class_name, None)
-                if isinstance(cls, type) and issubclass(cls, nn.Module):
+                cls: Any = getattr(import_module(library), class_name, None)
+                is_network = isinstance(cls, type) and issubclass(cls, nn.Module)
+                if is_network:
                     folder = model / name
-                    networks[name], info = cls.from_pretrained(  # type: ignore[attr-defined]  # of both libraries
+                    networks[name], info = cls.from_pretrained(
                         folder,
                         dtype=dtype,
                         variant=_variant(folder, dtype),

@@ -230,11 +230,17 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
 
 
 def _components(model_index: dict[str, Any]) -> list[str]:
-    """Return the folders of a pipeline of diffusers; an absent component is a list of nulls."""
+    """Return the folders of a pipeline of diffusers; an absent component is a list of nulls.
+
+    A name with a path would lead out of the folder: it is no component, and a pull would remove what is there.
+    """
     return [
         name
         for name, classes in model_index.items()
-        if not name.startswith("_") and isinstance(classes, list) and any(classes)
+        if not name.startswith(("_", "."))
+        and PurePath(name).name == name
+        and isinstance(classes, list)
+        and any(classes)
     ]
 
 

@@ -191,6 +191,6 @@ def test_guidance_has_the_name_that_has_an_effect(default: float, distilled: boo
             self.components = {"transformer": network}
 
         def __call__(self, prompt: str, true_cfg_scale: float = default, guidance_scale: float | None = None) -> None:
-            raise NotImplementedError
+            """Take the arguments; the signature alone is read."""
 
     assert guidance_arguments(Pipeline(), 7.0) == expected

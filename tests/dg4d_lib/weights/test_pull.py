@@ -1,5 +1,6 @@
 import errno
 import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -154,6 +155,17 @@ def test_a_list_of_files_that_cannot_be_read_is_downloaded_again(hub: Hub, tmp_p
     (tmp_path / "somebody--pictures/model_index.json").write_bytes(b'{"vae": [')
     pull(lookup_weights("somebody/pictures"), tmp_path)
     assert "model_index.json" in hub.downloaded
+
+
+@pytest.mark.parametrize("name", ["../mine.txt", "{folder}/mine.txt", ".."])
+def test_a_list_of_files_never_removes_what_lies_outside(name: str, hub: Hub, tmp_path: Path) -> None:
+    folder, mine = tmp_path / "somebody--pictures", tmp_path / "mine.txt"
+    folder.mkdir()
+    mine.write_text("of the user")
+    index = {name.format(folder=tmp_path): ["diffusers", "UNet2DConditionModel"]}
+    (folder / "model_index.json").write_text(json.dumps(index))
+    plan_pull(lookup_weights("somebody/pictures"), tmp_path)
+    assert mine.read_text() == "of the user"
 
 
 def test_a_download_that_is_not_what_the_hub_lists_is_refused(hub: Hub, tmp_path: Path) -> None:
