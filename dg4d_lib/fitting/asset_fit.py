@@ -16,12 +16,13 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, LOG_SCALE, across_weight
+from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, pyramid_residuals, resize_cutouts
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
 from dg4d_lib.fitting.node_pose import CONTINUED, Pose
+from dg4d_lib.fitting.rigidity import edge_energy
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.geometry.quaternion import quat_multiply, rotate
+from dg4d_lib.geometry.quaternion import quat_multiply
 from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import BLUR, Rasterizer, Rendering
@@ -31,7 +32,6 @@ ADVICE = "lower asset.lr"
 FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
 MATCH_ITERATIONS = 80  # of the colors at the first frame
 MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
-ROBUST = 0.05  # relative stretch up to which the rigidity is quadratic
 SPEEDS = (0.0, CONTINUED, 1.0)  # extrapolations of the last motion that are tried, where rotations are integrated
 
 
@@ -59,7 +59,6 @@ class AssetFit:
         self.area = float(self.alphas.mean().clamp(min=1e-3))  # of the subject, share of the picture
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         self.basis = NodeBasis(graph, settings.smoothing, settings.integrate_rotations)
-        self.spans = graph.spans
 
     def match_first_frame(self, pose: Pose) -> Gaussians:
         """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's.
@@ -207,14 +206,7 @@ class AssetFit:
 
     def rigidity(self, motion: NodeMotion) -> Float[Tensor, ""]:
         """Return the robust as-rigid-as-possible energy of the graph."""
-        matrices = self.graph.at_ends(motion.matrices.flatten(2))
-        first, second = self.graph.at_ends(motion.shifts)
-        moved = self.spans + second - first
-        turned = [rotate(matrix.unflatten(-1, (3, 3)), self.spans) for matrix in matrices]
-        stretch = torch.cat([(moved - span) / self.graph.lengths[:, None] for span in turned], 1)
-        bend = matrices[0] - matrices[1]
-        log = self.settings.rigidity_loss == "log"
-        return robust(stretch, log).mean() + self.settings.bending * robust(bend, log).mean()
+        return edge_energy(motion, self.graph, self.settings.bending, self.settings.rigidity_loss == "log")
 
     def step(self, losses: dict[str, Tensor], variables: NodeVariables, place: str) -> None:
         """Compute the gradients of the sum of the losses."""
@@ -234,9 +226,3 @@ def antialiased(cloud: Gaussians, camera: OrbitCamera) -> Gaussians:
     pixels2 = (cloud.log_scales.topk(2, -1).values.mean(-1) + math.log(camera.focal / camera.radius)).mul(2).exp()
     opacities = (cloud.opacities * pixels2 / (pixels2 + BLUR)).clamp(1e-3, 1 - 1e-3)
     return replace(cloud, opacity_logits=opacities.logit())
-
-
-def robust(values: Float[Tensor, "*b c"], log: bool) -> Float[Tensor, "*b"]:
-    """Return a loss of stretch or bend that is quadratic for small and linear for large vectors, or logarithmic."""
-    linear = (values.square().sum(-1) + ROBUST**2).sqrt() - ROBUST
-    return LOG_SCALE * torch.log1p(linear / LOG_SCALE) if log else linear

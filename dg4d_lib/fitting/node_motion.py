@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.fitting.node_kernels import has_kernels, moved_points, turned_edges
 from dg4d_lib.fitting.node_pose import CONTINUED, Pose
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.control_graph import ControlGraph
@@ -55,8 +56,15 @@ class NodeMotion:
         """Rotations of the nodes."""
         return quat_to_rotmat(self.quats)
 
+    @cached_property
+    def _whole_matrices(self) -> Float[Tensor, "t 3 3"]:
+        return quat_to_rotmat(self.whole_quats)
+
     def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
         """Return the points that the nodes of `graph` move, at every frame."""
+        if has_kernels(self.quats):
+            moved = moved_points(self.quats, self.shifts, graph.nodes, rest, graph.indices, graph.weights)
+            return self._placed(moved, graph)
         origins = graph.nodes + self.shifts - rotate(self.matrices, graph.nodes)  # x -> R x + origin
         affine = torch.cat([self.matrices, origins[..., None]], -1).flatten(2)  # t m 12
         blended = graph.blend(affine).unflatten(-1, (3, 4))
@@ -74,7 +82,7 @@ class NodeMotion:
 
     def _placed(self, points: Float[Tensor, "t v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
         center = graph.nodes.mean(0)
-        turned = (points - center) @ quat_to_rotmat(self.whole_quats).mT
+        turned = (points - center) @ self._whole_matrices.mT
         return turned + center + self.whole_shifts[:, None]
 
 
@@ -90,7 +98,6 @@ class NodeBasis:
         self.smoothing = _smoothing(graph, strength)
         self.integrated = integrated
         self._graph = graph
-        self._spans = graph.spans
         self._centered = graph.nodes - graph.nodes.mean(0)
         self._integral = _integral(graph) if integrated else None
 
@@ -98,9 +105,11 @@ class NodeBasis:
         """Return the shifts, mean 0, that turn every edge as its ends turn, in least squares; 0 if not integrated."""
         if self._integral is None:
             return torch.zeros_like(quats[..., 1:])
+        if has_kernels(quats):
+            return self._integral @ turned_edges(quats, self._graph.spans, self._graph.edges) - self._centered
         first, second = self._graph.at_ends(quat_to_rotmat(quats).flatten(2))
         turns = (0.5 * (first + second)).unflatten(-1, (3, 3))
-        return self._integral @ rotate(turns, self._spans) - self._centered
+        return self._integral @ rotate(turns, self._graph.spans) - self._centered
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from dg4d_lib.fitting.asset_fit import AssetFit, robust
+from dg4d_lib.fitting.asset_fit import AssetFit
 from dg4d_lib.fitting.rigid_parts import RigidMotion
+from dg4d_lib.fitting.rigidity import robust
 from dg4d_lib.geometry.quaternion import rotate
 
 ITERATIONS = 24  # at most

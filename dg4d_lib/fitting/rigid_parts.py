@@ -103,7 +103,7 @@ def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int
         pieces: connected piece of the surface that every point belongs to, from 0 on.
     """
     members = functional.one_hot(parts)
-    shares = graph.blend(members.to(graph.weights)[None])[0]
+    shares = (members[graph.indices] * graph.weights[..., None]).sum(1)
     sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
     largest, owner = (sums / sums.sum(1, keepdim=True)).max(1)
     whole = (largest > NEARLY_ONE)[pieces, None]

@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from dg4d_lib.mesh.models.sparse_map import SparseMap
 from dg4d_lib.mesh.neighbors import mesh_edges
 
 NEIGHBORS = 4  # nodes that move a point
@@ -51,7 +50,7 @@ class ControlGraph:
     edges: Int[Tensor, "e 2"]
     lengths: Float[Tensor, " e"]
 
-    @property
+    @cached_property
     def spans(self) -> Float[Tensor, "e 3"]:
         """Vectors along the edges at rest, from the first node to the second one."""
         ends = self.nodes[self.edges]
@@ -63,7 +62,7 @@ class ControlGraph:
 
     def blend(self, values: Float[Tensor, "t m c"]) -> Float[Tensor, "t v c"]:
         """Return the weighted mean of the nodes' values at every point; its gradient is the same in every run."""
-        return self._blending(values)
+        return self._blending @ values
 
     def blend_rotations(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t v 4"]:
         """Return the weighted mean of the nodes' rotations at every point, unit quaternions.
@@ -82,16 +81,16 @@ class ControlGraph:
     def at_ends(self, values: Float[Tensor, "t m c"]) -> tuple[Float[Tensor, "t e c"], Float[Tensor, "t e c"]]:
         """Return the nodes' values at both ends of the edges; their gradient is the same in every run."""
         first, second = self._ends
-        return first(values), second(values)
+        return first @ values, second @ values
 
     @cached_property
-    def _blending(self) -> SparseMap:
-        return SparseMap(self.indices, self.weights, len(self.nodes))
+    def _blending(self) -> Float[Tensor, "v m"]:
+        return self.weights.new_zeros(len(self.indices), len(self.nodes)).scatter_(1, self.indices, self.weights)
 
     @cached_property
-    def _ends(self) -> tuple[SparseMap, SparseMap]:
-        ones = self.lengths.new_ones(len(self.edges), 1)
-        first, second = (SparseMap(self.edges[:, end : end + 1], ones, len(self.nodes)) for end in (0, 1))
+    def _ends(self) -> tuple[Float[Tensor, "e m"], Float[Tensor, "e m"]]:
+        """Matrices that choose the rows of either end: the gradient of indexing adds in any order on a GPU."""
+        first, second = functional.one_hot(self.edges.T, len(self.nodes)).to(self.lengths)
         return first, second
 
 

@@ -9,7 +9,7 @@ import torch
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting import asset_fit, asset_motion, flow_tracking
+from dg4d_lib.fitting import asset_motion, flow_tracking, rigidity
 from dg4d_lib.fitting.asset_fit import AssetFit, antialiased
 from dg4d_lib.fitting.asset_motion import Report, fit_asset_motion, iterations
 from dg4d_lib.fitting.flow_tracking import FlowTracker
@@ -278,10 +278,10 @@ def test_loops_are_tracked_from_both_ends(
 @pytest.mark.parametrize("log", [False, True])
 def test_tracking_and_refinement_have_one_rigidity(log: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gauss-Newton steps solve least squares, reweighted by the derivative of the refinement's loss."""
-    monkeypatch.setattr(asset_fit, "ROBUST", flow_tracking.ROBUST)
+    monkeypatch.setattr(rigidity, "ROBUST", flow_tracking.ROBUST)
     stretch = torch.logspace(-3, 0.5, 20, dtype=torch.float64)[:, None] * torch.tensor([0.6, 0.0, 0.8])
     stretch.requires_grad_()
-    asset_fit.robust(stretch, log).sum().backward()
+    rigidity.robust(stretch, log).sum().backward()
     divisor = torch.from_numpy(flow_tracking._softened(stretch.detach().numpy(), log))
     torch.testing.assert_close(stretch.grad, stretch.detach() / divisor[:, None], rtol=0.07, atol=0)
 
