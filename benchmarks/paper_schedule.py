@@ -48,14 +48,8 @@ from dg4d_lib.images import over_white
 from dg4d_lib.input_settings import SvdSettings
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
-from dg4d_lib.settings import (
-    BlobStartSettings,
-    MotionSettings,
-    Precision,
-    StaticSettings,
-    VideoToVideoSettings,
-    Zero123PriorSettings,
-)
+from dg4d_lib.refiner_settings import VideoToVideoSettings
+from dg4d_lib.settings import BlobStartSettings, MotionSettings, Precision, StaticSettings, Zero123PriorSettings
 from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.texture.refiner import VideoToVideo
 from dg4d_lib.video.driving import DrivingVideo

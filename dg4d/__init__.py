@@ -54,6 +54,9 @@ def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'dg4d' has no attribute {name!r}; it has: {', '.join(__all__)}")
     _check_parts()
+    from steps.store.files import make_folders_absolute
+
+    make_folders_absolute()
     module, _, attribute = _PLACES[name].partition(":")
     value = getattr(import_module(module), attribute)
     globals()[name] = value

@@ -48,9 +48,10 @@ def commands_page() -> str:
 def settings_page() -> str:
     """Return the page of all settings, a table per section and kind."""
     intro = (
-        "Change a setting with `--set NAME=VALUE`; values are JSON or plain text. The default is the paper's where the"
-        "\nmeaning does not say otherwise. `dg4d make` starts from the profile `preview`, whose values are listed where"
-        "\nthey differ. `dg4d settings NAME` prints the same; `--profile` shows another profile.\n"
+        "Change a setting with `--set NAME=VALUE`; values are JSON or plain text. The column `default` holds the"
+        "\npaper's numbers where the paper has them; a profile sets which models are used."
+        "\n`dg4d settings --profile paper` prints the paper's configuration. `dg4d make` starts from the profile"
+        "\n`preview`, whose values are listed where they differ. `dg4d settings NAME` prints the same.\n"
     )
     parts = [NOTE, "# Settings\n", intro]
     for section in SECTIONS:

@@ -1,5 +1,6 @@
 """Make every file of this folder again: `python -m examples.make_examples`. Equal code gives equal bytes."""
 
+import argparse
 from pathlib import Path
 
 import av
@@ -23,6 +24,7 @@ FPS = 12
 
 def main() -> None:
     """Draw the creatures: two cut-outs, and a video before plain white."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     newt = Newt()
     camera = OrbitCamera(width=PICTURE_SIZE, height=PICTURE_SIZE)
     write_png(FOLDER / "newt.png", draw(newt, 0.0, camera))

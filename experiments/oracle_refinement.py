@@ -15,7 +15,7 @@ views that ablations score; flicker is the mean change of a texel from frame to 
 ground truth. With trained models: `benchmarks.refinement`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +33,6 @@ from torch.nn.functional import interpolate
 from benchmarks.objects.drawing import Painted
 from benchmarks.objects.specimens import FPS, OBJECTS, SCORED_AZIMUTHS_DEG
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.diffusion.video_model import karras_sigmas, start_index
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import Texels, locate_texels
@@ -41,12 +40,12 @@ from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.metrics.image import psnr
-from dg4d_lib.settings import TextureSettings
+from dg4d_lib.refiner_settings import TextureSettings, VideoToVideoSettings
 from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
+from dg4d_lib.texture.refiner import noise_levels
 from dg4d_lib.video.driving import DrivingVideo
 
-STRENGTHS = (0.4, 0.3, 0.25, 0.2)  # fractions of the noise levels; 0.3 is the paper's
-STEPS = 25  # noise levels of the full schedule
+STRENGTHS = (0.4, 0.3, 0.25, 0.2)  # fractions of the noise levels, 1 - T in the paper's words; 0.3 is the paper's
 UNIT = 0.25  # color units per latent standard deviation
 VAE_SCALE_FACTOR = 8  # pixels per latent and side
 TRUST = 0.5  # standard deviation of the oracle's distribution, latents
@@ -57,6 +56,7 @@ BLURRED_OVER = 0.02  # neighbors averaged by the blur, fraction of all vertices
 VARIANTS = {
     "before": Variant(),
     **{f"video to video, {strength:g}": Variant({"strength": strength}) for strength in STRENGTHS},
+    "video to video, 0.3 to 0.05": Variant({"strength": 0.3, "strength_end": 0.05}),  # over the iterations
     "image to image, 0.3": Variant({"strength": 0.3}, per_frame=True),
 }
 FLICKER = Ablation(
@@ -66,9 +66,11 @@ FLICKER = Ablation(
     caveat="the consistency of videos is an assumption of the oracle",
 )
 NOISE = Ablation(
-    "textures with a strength of 0.4 or 0.2 are worse than with 0.3",
+    "textures with a strength of 0.4 or 0.2, or annealed from 0.3 to 0.05, are worse than with 0.3",
     VARIANTS,
-    tuple(Claim("video to video, 0.3", f"video to video, {other:g}", "psnr_obj") for other in (0.4, 0.2)),
+    tuple(
+        Claim("video to video, 0.3", f"video to video, {other}", "psnr_obj") for other in ("0.4", "0.2", "0.3 to 0.05")
+    ),
     caveat="the accuracy of the oracle is an assumption",
 )
 
@@ -155,8 +157,9 @@ def _fill_gaps(places: Texels, colors: Float[Tensor, "p 3"], size: int) -> Float
 class Oracle:
     """Refiner with knowledge of the ground truth, plus random stains."""
 
-    def __init__(self, model: Model, sigma: float, whole_videos: bool) -> None:
-        self.model, self.sigma, self.whole_videos = model, sigma, whole_videos
+    def __init__(self, model: Model, sigma_at: Callable[[float], float], whole_videos: bool) -> None:
+        """Store the model and the noise level as a function of the progress of the iterations in [0, 1]."""
+        self.model, self.sigma_at, self.whole_videos = model, sigma_at, whole_videos
 
     def refine(
         self,
@@ -165,27 +168,28 @@ class Oracle:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """Denoise as described in the module docstring; progress is ignored."""
+        """Denoise as described in the module docstring."""
+        sigma = self.sigma_at(progress)
         frames, height, width = video.shape[:3]
         stains = [self.model.stained(generator) for _ in range(1 if self.whole_videos else frames)]
         believed = self.model.draw(stains * (frames // len(stains)), cameras)[..., :3]
         latents = torch.randn(frames, 3, height // VAE_SCALE_FACTOR, width // VAE_SCALE_FACTOR, generator=generator)
         noise = interpolate(latents, (height, width), mode="bilinear").movedim(1, -1)
         left = 1 / frames**0.5 if self.whole_videos else 1.0
-        keep = TRUST / (TRUST**2 + self.sigma**2) ** 0.5
-        return (believed + keep * (video + self.sigma * UNIT * left * noise - believed)).clamp(0, 1)
+        keep = TRUST / (TRUST**2 + sigma**2) ** 0.5
+        return (believed + keep * (video + sigma * UNIT * left * noise - believed)).clamp(0, 1)
 
 
 def refine_model(model: Model, variant: Variant, settings: TextureSettings, seed: int) -> RefinedTextures:
     """Refine the blurred texture with the pipeline's loop; return it unchanged without a noise level."""
     if not variant.changes:
         return RefinedTextures(model.blurred)
-    sigma = karras_sigmas(STEPS)[start_index(STEPS, variant.changes["strength"])]
+    levels = VideoToVideoSettings(**variant.changes)
     front = [OrbitCamera(width=settings.size, height=settings.size)] * len(model.offsets)
     seen = model.draw([model.mesh.texture] * len(front), front)
     video = DrivingVideo(seen[..., :3], seen[..., 3:], FPS)
     clip = MeshClip(replace(model.mesh, texture=model.blurred), model.offsets)
-    oracle = Oracle(model, sigma, whole_videos=not variant.per_frame)
+    oracle = Oracle(model, lambda progress: noise_levels(levels, progress)[0], whole_videos=not variant.per_frame)
     return refine_textures([clip], video, oracle, settings, torch.Generator().manual_seed(seed))[0]
 
 

@@ -1,7 +1,7 @@
 """Flows that convert many jobs, a few at a time; a failed one does not stop the others."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
@@ -31,7 +31,6 @@ from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
 Convert = Callable[[ConversionJob, Path], tuple[Any, bool]]
-Allow = Callable[[Item], None]
 
 JOBS_MEDIA_TYPE = "application/vnd.dg4d.orders+jsonl"
 RETRY_NOTE = " (will be retried at the end)"  # in the message of a crashed item
@@ -51,23 +50,20 @@ def convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None
     _convert_jobs(jobs, out, workers, title)
 
 
-def run_catalog(request: CatalogRequest, title: str, progress: BatchProgress, allow: Allow | None = None) -> None:
+def run_catalog(request: CatalogRequest, title: str, progress: BatchProgress, items: list[Item]) -> None:
     """Convert a catalog within the current flow run, or in a new run if there is none.
 
     Args:
         request: the catalog.
         title: name of the new run.
         progress: holds the rows of items that need no conversion, and receives all others.
-        allow: raises BadInput for an item that must not be converted here; used within the current run only.
+        items: of the catalog, so that it is not read again.
 
     Raises:
         KeyboardInterrupt: the user stopped the catalog; finished items stay, and `progress` has their rows.
     """
-    with flow_context(), _reporting(request.out, progress):
-        if FlowRunContext.get() is None:
-            catalog(request, title)
-        else:
-            _convert_catalog(request, title, allow)
+    with flow_context(), _reporting(request.out, progress, items):
+        (catalog if FlowRunContext.get() is None else _convert_catalog)(request, title)
 
 
 def run_jobs(jobs: list[ConversionJob], out: Path, workers: int, title: str, progress: BatchProgress) -> None:
@@ -132,25 +128,28 @@ def convert(item: str, job: str, out: str, strict: bool, attempt: int, work: Con
     return row.model_dump(mode="json"), may_heal
 
 
-_progress_of: dict[Path, BatchProgress] = {}  # by output folder
+_reported: dict[Path, tuple[BatchProgress, Sequence[Item]]] = {}  # by output folder
 
 
 @contextmanager
-def _reporting(out: Path, progress: BatchProgress) -> Iterator[None]:
+def _reporting(out: Path, progress: BatchProgress, items: Sequence[Item] = ()) -> Iterator[None]:
     """Let the catalog of this process that writes to `out` report to `progress`, and skip the rows that it has.
 
-    Without it, as in a resumed flow run, the catalog checks every item again.
+    Without it, as in a resumed flow run, the catalog reads and checks every item again.
     """
-    _progress_of[out] = progress
+    _reported[out] = progress, items
     try:
         yield
     finally:
-        del _progress_of[out]
+        del _reported[out]
 
 
-def _convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = None) -> None:
-    items = request.items(allow)
-    progress = _progress_of.get(request.out) or BatchProgress(len(items))
+def _convert_catalog(request: CatalogRequest, title: str) -> None:
+    if request.out in _reported:
+        progress, items = _reported[request.out]
+    else:
+        items = request.items()
+        progress = BatchProgress(len(items))
     todo = (ready(item, request.out, request.strict) for item in items if item.name not in progress.rows)
     convert_all(todo, request.out, request.workers, title, progress, request.strict, request.where)
 
@@ -158,7 +157,8 @@ def _convert_catalog(request: CatalogRequest, title: str, allow: Allow | None = 
 def _convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
     lines = home.store().path(jobs).read_bytes().splitlines()
     todo = (ConversionJob.model_validate_json(line) for line in lines)
-    convert_all(todo, out, workers, title, _progress_of.get(out) or BatchProgress(len(lines)))
+    progress = _reported[out][0] if out in _reported else BatchProgress(len(lines))
+    convert_all(todo, out, workers, title, progress)
 
 
 def _attempt(

@@ -6,6 +6,7 @@ Commands import their modules when they run, so that `--help` and completion are
 """
 
 import io
+import logging
 import math
 import os
 import shlex
@@ -72,6 +73,10 @@ def dg4d(
     ] = False,
 ) -> None:
     """Convert pictures and videos to animated, textured 3D assets."""
+    with exit_on_error():
+        from steps.store.files import make_folders_absolute
+
+        make_folders_absolute()
 
 
 @app.command()
@@ -422,6 +427,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    logging.raiseExceptions = False  # Prefect prints an error for log lines that do not reach the server
     app()
 
 

@@ -42,22 +42,26 @@ def connect() -> None:
     """Connect to a Prefect server, by default the background server; import Prefect and the flows while it starts.
 
     Raises:
-        ServerUnavailable: the server does not answer.
+        ServerUnavailable: the server does not answer, or another program took its port.
+        BadInput: `$DG4D_SERVER_IDLE_S` is not a number of seconds.
         DiskFull: the disk of the home folder is nearly full.
     """
     require_free_space(store_home())
-    own = os.environ.get("PREFECT_API_URL")
-    if own:
-        _announce(f"connecting to the Prefect server {own}")
-        home.set_environment(own)
-        _check(own)
+    server, given = background.background_server(), os.environ.get("PREFECT_API_URL")
+    if given and not server.is_at(given):  # an earlier call sets the variable to the background server
+        _announce(f"connecting to the Prefect server {given}")
+        home.set_environment(given)
+        _check(given)
     else:
-        server = background.background_server()
         if server.address() is None:
             first = "" if server.has_database() else "; the first start creates its database, about 10 s"
             _announce(f"{STARTING}{first}")
         server.start()
-        background.set_own_server(server, server.wait_for_address())
+        address = server.wait_for_address()
+        if given and given != f"{address}/api":
+            server.release()
+            raise ServerUnavailable(f"another program took the port of the Prefect server at {given}; run this again")
+        background.set_own_server(server, address)
         _announce("importing the flows")
         with collector_resting():
             importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
@@ -98,6 +102,7 @@ def convert_job(
         StepError: a step failed; `folder` is unchanged.
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; `folder` is unchanged.
         BackendUnavailable: a key is configured, and signing is not installed.
+        ServerUnavailable: the server ended, and does not answer again.
     """
     from flows.engine.events import StepEvent, emit
     from flows.engine.leases import running
@@ -124,7 +129,7 @@ def convert_job(
 def run_flow(
     job: ConversionJob, folder: Path | None = None, refresh: bool = False, mesh_parts: int = 0
 ) -> "FlowResult":
-    """Run the flow of a job.
+    """Run the flow of a job; if the server restarts meanwhile, go on after the last finished step.
 
     Args:
         job: job to convert.
@@ -134,17 +139,19 @@ def run_flow(
 
     Raises:
         StepError: a step failed.
+        ServerUnavailable: the server ended, and does not answer again.
     """
     from prefect.settings import PREFECT_TASKS_REFRESH_CACHE
     from prefect.task_runners import ThreadPoolTaskRunner
 
     from flows import pipeline
     from flows.engine.resources import slots
+    from flows.ui.showing import run_again
 
     flow = pipeline.text_to_4d if job.drawn else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
     runner: Any = ThreadPoolTaskRunner(max_workers=slots())
     with _flow_context(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
-        return flow.with_options(task_runner=runner)(job, folder, mesh_parts)
+        return run_again(lambda: flow.with_options(task_runner=runner)(job, folder, mesh_parts))
 
 
 def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
@@ -154,9 +161,10 @@ def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
         StepError: a step failed.
     """
     from flows.pipeline import motions
+    from flows.ui.showing import run_again
 
     with _flow_context(job):
-        outputs = motions(job)
+        outputs = run_again(lambda: motions(job))
     store = home.store()
     folder.mkdir(parents=True, exist_ok=True)
     store.get(outputs["candidates"], folder / "motions.png")

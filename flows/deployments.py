@@ -32,7 +32,7 @@ from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.output_lock import is_up_to_date
 from flows.engine.shared_results import sharing_results
-from flows.inputs.conversion_job import ConversionJob, ConversionRequest
+from flows.inputs.conversion_job import ConversionRequest
 from flows.inputs.fetching import local_copy, without_secrets
 from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import box_settings, parse_changes
@@ -425,20 +425,8 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     check_folder(folder, request.item)
     job = request.to_job(home.store())
     if not is_up_to_date(folder, job.digest()):
-        _convert_patiently(job, folder)
-
-
-def _convert_patiently(job: ConversionJob, folder: Path) -> None:
-    """Convert a job; if the server restarts meanwhile, convert it again after the last finished step."""
-    for start in range(1, MOST_STARTS + 1):
         _patiently(connect)
-        try:
-            convert_job(job, folder)
-        except httpx.TransportError:
-            if start == MOST_STARTS:
-                raise
-        else:
-            return
+        convert_job(job, folder)
 
 
 def _patiently(work: Callable[[], None]) -> None:

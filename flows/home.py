@@ -19,6 +19,7 @@ CLIENT_SETTINGS = {
     "PREFECT_CLI_PROMPT": "false",
     "PREFECT_CLIENT_MAX_RETRIES": "7",  # 4 minutes, enough for a restart of the server; 10 are 34 minutes
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # commands print their own messages; logs go to the server
+    "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",  # of threads that lose the server; their callers try again
 }
 
 

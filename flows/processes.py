@@ -2,6 +2,7 @@
 
 import ctypes
 import fcntl
+import functools
 import os
 import signal
 import socket
@@ -25,8 +26,11 @@ def start_of(pid: int) -> str:
 
 def host_id() -> str:
     """Return `$DG4D_HOST_ID`, else host name and PID namespace: containers may share the name of their host."""
-    if given := os.environ.get("DG4D_HOST_ID"):
-        return given
+    return os.environ.get("DG4D_HOST_ID") or _host_and_namespace()
+
+
+@functools.cache  # the host name may change while a process runs, its identity may not
+def _host_and_namespace() -> str:
     try:
         return f"{socket.gethostname()}-{Path('/proc/self/ns/pid').stat().st_ino}"
     except OSError:  # no Linux

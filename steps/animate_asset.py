@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb
 from dg4d_lib.assets.formats.foreign_joints import read_skeleton
+from dg4d_lib.assets.formats.foreign_motion import write_moving_glb
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
@@ -39,7 +40,7 @@ from steps.runtime.job import Job, StepReport
 
 PICTURE_FRAMES = 6
 NOTE = "The motion of sides that the video does not show follows from the rigidity of the surface."
-RIGID_NOTE = "Rigid parts that the model moves as: {}. They show the video better than a surface that bends."
+RIGID_NOTE = "The model moves as {} rigid part{}; this shows the video better than a surface that bends."
 JOINT_NOTE = "The skeleton of the model moves it; how limbs turn where the video does not show it is a guess."
 
 
@@ -124,7 +125,7 @@ def merged_graph(cloud: Gaussians, graph: ControlGraph, most: int) -> tuple[Gaus
 def motion_note(motion: NodeMotion, most_parts: int) -> str:
     """Return what the motion of sides that the video does not show follows from."""
     parts = int(motion.parts.max()) + 1
-    return RIGID_NOTE.format(parts) if parts <= most_parts else NOTE
+    return RIGID_NOTE.format(parts, "s" * (parts != 1)) if parts <= most_parts else NOTE
 
 
 def moving_graph(
@@ -191,15 +192,14 @@ def moved_vertices(
 def _write_mesh(job: Job, mesh: PlacedMesh, motion: NodeMotion, fps: float, note: str) -> list[str]:
     """Write the model with morph targets, and as a tracked mesh with one texture; return notes."""
     vertices, flipped = moved_vertices(mesh.surface, mesh.graph, motion)
-    gltf = job.settings.gltf
     content, notes = write_moving_glb(
         mesh.glb,
         mesh.placement.matrix,
         vertices.numpy(),
         fps,
         {"notes": [note]},
-        gltf.interpolation.upper(),
-        gltf.moving_normals,
+        job.settings.interpolation.upper(),
+        job.settings.moving_normals,
     )
     job.outputs["moving"].write_bytes(content)
     merged, sources = merge_parts(mesh.glb.model.placed(mesh.placement.matrix), job.settings.texture_size)

@@ -186,7 +186,13 @@ STEPS: dict[str, StepSpec] = {
                 "curves": CURVES,
                 "picture": PNG,
             },
-            sections=("rasterizer", "asset", "pack.gltf", "mesh.texture_size"),
+            sections=(
+                "rasterizer",
+                "asset",
+                "pack.gltf.interpolation",
+                "pack.gltf.moving_normals",
+                "mesh.texture_size",
+            ),
             resource="gpu",
         ),
         _step(

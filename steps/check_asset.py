@@ -140,6 +140,7 @@ def collect_evidence(
         flaws=flaws,
         folds=folds,
         own_model=asset.own_model,
+        per_frame=not isinstance(asset.surface, Asset4D),
     )
 
 

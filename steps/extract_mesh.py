@@ -412,7 +412,10 @@ def _faired(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], s
 def _soundness(meshes: dict[int, TexturedMesh]) -> list[str]:
     checks = {frame: _check(mesh) for frame, mesh in meshes.items()}
     flawed = [f"the mesh of frame {frame} is {check}" for frame, check in checks.items() if not check.valid]
-    return [f"{len(checks) - len(flawed)} of {len(checks)} meshes from frame {min(checks)} on bound solids", *flawed]
+    if len(checks) == 1:
+        return flawed or [f"the mesh of frame {min(checks)} is a closed surface without defects"]
+    sound = f"{len(checks) - len(flawed)} of {len(checks)}" if flawed else f"all {len(checks)}"
+    return [f"{sound} meshes of frames {min(checks)} to {max(checks)} are closed surfaces without defects", *flawed]
 
 
 def _check(mesh: TexturedMesh) -> MeshTopology:

@@ -144,10 +144,11 @@ def _disagreement(placement: Placement, settings: AssetSettings) -> str:
 def _notes(own: OwnModel, placement: Placement, job: Job) -> list[str]:
     if own.glb is not None:
         model = own.glb.model
-        kind = f"{len(model.parts)} mesh parts, {len(model.vertices)} vertices, {len(model.faces)} triangles"
+        parts, vertices, faces = len(model.parts), len(model.vertices), len(model.faces)
+        kind = f"{parts} mesh part{'s' * (parts != 1)}, {vertices} vertices, {faces} triangle{'s' * (faces != 1)}"
     else:
         assert own.splats is not None  # a model is a mesh or splats
-        kind = f"{len(own.splats)} splats"
+        kind = f"{len(own.splats)} splat{'s' * (len(own.splats) != 1)}"
     notes = [f"the shape is a model of the user's own ({kind})"]
     if "subject" in job.inputs:
         notes.append(

@@ -1,6 +1,7 @@
 """Settings of the pipeline and of its steps, named profiles, and changes by dotted keys."""
 
 import functools
+from collections.abc import Collection
 from operator import attrgetter
 from typing import Annotated, Any, Literal, Self
 
@@ -17,20 +18,17 @@ from dg4d_lib.input_settings import (
     WarpSettings,
 )
 from dg4d_lib.rasterizer.backends import backend_name
+from dg4d_lib.refiner_settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.settings import (
     DeformationSettings,
     GeometricPriorSettings,
     HexPlaneSettings,
-    IdentitySettings,
-    ImageToImageSettings,
     MeshSettings,
     MotionSettings,
     PriorSettings,
-    RefinerSettings,
     ResolutionStage,
     Settings,
     StaticSettings,
-    VideoToVideoSettings,
     Zero123PriorSettings,
 )
 from dg4d_lib.weights.registry import lookup_weights
@@ -219,6 +217,12 @@ def step_settings(step: str, settings: PipelineSettings, **values: Any) -> Setti
     spec = STEPS[step]
     sections = {section.rpartition(".")[2]: attrgetter(section)(settings) for section in spec.sections}
     return settings_class(spec)(**sections, **values)
+
+
+def is_read(setting: str, steps: Collection[str]) -> bool:
+    """Return true if one of the steps reads a setting of the pipeline, given by its dotted name."""
+    sections = {section for spec in STEPS.values() if spec.name in steps for section in spec.sections}
+    return any(f"{setting}.".startswith(f"{section}.") for section in sections)
 
 
 def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSettings:

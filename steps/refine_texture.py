@@ -13,9 +13,9 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
+from dg4d_lib.refiner_settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
-from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
+from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo, noise_levels
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import read_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
@@ -65,7 +65,9 @@ def _refine(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures],
             opened = open_weights(kind.model.weights)
             model = VideoModel.load(opened.folder, kind.model, device)
             refiner, run_notes = VideoToVideo(kind, model, pictures[0]), model.notes
-            method = f"by video diffusion from sigma {refiner.sigmas[0]:.3f} on, {len(refiner.sigmas) - 1} steps"
+            method = f"by video diffusion {_range(noise_levels(kind, 0.0))}"
+            if kind.strength_end:
+                method += f" (in the last iteration {_range(noise_levels(kind, 1.0))})"
         case ImageToImageSettings():
             opened = open_zero123("refiner.prior", kind.prior)
             loaded = Zero123.load(opened.folder, kind.prior, device)
@@ -84,6 +86,11 @@ def _refine(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures],
         RefinedTextures(each.texture.cpu(), None if each.frame_textures is None else each.frame_textures.cpu())
         for each in refined
     ], report
+
+
+def _range(sigmas: Sequence[float]) -> str:
+    """Return the first noise level and the number of steps."""
+    return f"from sigma {sigmas[0]:.3f} on, {len(sigmas) - 1} steps"
 
 
 def _to_device(mesh: TexturedMesh, device: torch.device) -> TexturedMesh:

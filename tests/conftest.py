@@ -2,10 +2,12 @@
 
 import gc
 import os
+import resource
 import shutil
 import signal
 import tempfile
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,22 @@ def quick_segmentation(monkeypatch: pytest.MonkeyPatch) -> None:
         return ((picture - picture[0, 0]).abs().amax(-1) * 4).clamp(0, 1)
 
     monkeypatch.setattr(SegmentationNetwork, "probability", far_from_corner)
+
+
+@pytest.fixture
+def no_room() -> AbstractContextManager[None]:
+    """Context in which no file takes a byte, as on a full disk, though files can be created."""
+
+    @contextmanager
+    def limited() -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited()
 
 
 def pytest_unconfigure() -> None:

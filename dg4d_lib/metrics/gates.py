@@ -7,7 +7,7 @@ are taken of both forms of an asset, splats and mesh, and the worse one counts.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,54 @@ STILL = 0.002  # imperceptible change per frame and subject pixel, colors in [0,
 PLAIN = 0.002  # color gradient per pixel of an image without texture (ours)
 DEPTH_TOLERANCE = 0.05  # world units between the positions of one point in two views (ours)
 SPLATS, MESH = "splats", "mesh"  # the forms of an asset
+LOW, HIGH = "low", "high"  # sides of the bounds
+
+# Advice by gate and side of the bounds, and by form where it depends on that.
+_Advice = Mapping[tuple[str, str], str | Mapping[str, str]]
+_TRACKED: _Advice = {
+    ("fidelity", LOW): {
+        SPLATS: "raise static.iterations or motion.iterations (the report's image shows which)",
+        MESH: "raise mesh.render_size",
+    },
+    ("silhouette", LOW): "if single frames fail, raise motion.iterations; if all do, check the cut-out for remaining "
+    "background",
+    ("consistency", LOW): "the shape falls apart from other sides: raise static.iterations and static.views, or try "
+    "another seed",
+    ("flicker", HIGH): "raise motion.iterations or deformation.smoothness_weight (typical: 0.01)",
+    ("floaters", HIGH): {
+        SPLATS: "raise static.prune_opacity, or remove specks from the cut-out",
+        MESH: "raise mesh.min_component, or remove specks from the cut-out",
+    },
+    ("flaws", HIGH): "use mesh.source=gaussians with another mesh.density_threshold or a larger mesh.grid",
+    ("folds", HIGH): "for complex motions: --set mesh.mode=per_frame; else use a smaller mesh.grid",
+    ("agreement", LOW): "for missing thin parts: --set mesh.source=gaussians --set mesh.density_threshold=0.25; for "
+    "complex motions: --set mesh.mode=per_frame",
+    ("sharpness", LOW): {SPLATS: "raise static.iterations", MESH: "raise mesh.texture_size and mesh.render_size"},
+    ("sharpness", HIGH): "lower static.color_lr",
+    ("motion", LOW): "raise motion.iterations",
+    ("motion", HIGH): "lower motion.plane_lr or motion.network_lr",
+}
+_PER_FRAME: _Advice = {
+    **_TRACKED,
+    ("flaws", HIGH): "use another mesh.density_threshold or a larger mesh.grid",
+    ("folds", HIGH): "use a smaller mesh.grid",
+    ("agreement", LOW): "for missing thin parts: lower mesh.density_threshold (default: 0.5) or raise mesh.grid",
+}
+_OWN_MODEL: _Advice = {
+    ("fidelity", LOW): "raise asset.joint_iterations or asset.nodes; the colors stay those of the model",
+    ("silhouette", LOW): "if single frames fail, raise asset.joint_iterations or asset.nodes; if all do, give "
+    "--asset-azimuth, or check the cut-out for remaining background",
+    ("consistency", LOW): "raise asset.points",
+    ("flicker", HIGH): "raise asset.smoothness",
+    ("floaters", HIGH): "parts of the model lie apart from it; no setting removes them",
+    ("flaws", HIGH): "raise asset.rigidity",
+    ("folds", HIGH): "raise asset.rigidity",
+    ("agreement", LOW): "raise asset.points",
+    ("sharpness", LOW): {SPLATS: "raise asset.points", MESH: "raise mesh.texture_size"},
+    ("sharpness", HIGH): "the texture of the model is sharper than the picture; no setting changes it",
+    ("motion", LOW): "raise asset.joint_iterations or lower asset.smoothness",
+    ("motion", HIGH): "raise asset.smoothness",
+}
 
 
 @dataclass(frozen=True)
@@ -74,6 +122,7 @@ class GateInputs:
         flaws: broken edges and triangles of the mesh, per triangle.
         folds: share of the triangles of the mesh that cross others, are flipped or folded, in the worst frame.
         own_model: the mesh is a model of the user's own; flaws and folds are those that its motion adds.
+        per_frame: every frame has a mesh of its own.
     """
 
     picture: RgbaImages
@@ -84,6 +133,7 @@ class GateInputs:
     flaws: float
     folds: float
     own_model: bool = False
+    per_frame: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,7 +147,7 @@ class Gate:
         most: upper bound; None: unbounded.
         unit: of the values; empty for ratios.
         meaning: description in one line.
-        advice: remedy for a failed gate.
+        advice: remedy for a failed gate; empty if it passed.
     """
 
     name: str
@@ -106,7 +156,7 @@ class Gate:
     most: float | None
     unit: str
     meaning: str
-    advice: str
+    advice: str = ""
 
     @property
     def form(self) -> str:
@@ -123,6 +173,12 @@ class Gate:
         """True if all values are within the bounds, ends included."""
         return self._margin(self.value) >= 0
 
+    def side(self, value: float) -> str:
+        """Return the side of the bounds on which a value lies, `low` or `high`; empty within them."""
+        if self.least is not None and value < self.least:
+            return LOW
+        return HIGH if self.most is not None and value > self.most else ""
+
     def _margin(self, value: float) -> float:
         """Return the distance of a value to the nearest bound; negative outside."""
         below = math.inf if self.least is None else value - self.least
@@ -134,7 +190,7 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
     """Evaluate all gates, in the order of the report."""
     video, input_views, side_views = inputs.video, inputs.input_views, inputs.side_views
     video_floaters = float(floaters(video).mean())
-    return [
+    gates = [
         Gate(
             "fidelity",
             {
@@ -145,7 +201,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             "dB",
             "agreement with the video from the input camera: PSNR on the subject, mean over frames",
-            "raise static.iterations, motion.iterations or mesh.render_size; the report's image shows which",
         ),
         Gate(
             "silhouette",
@@ -154,7 +209,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             "",
             "overlap of the silhouette with the video's from the input camera, in the worst frame",
-            "if single frames fail, raise motion.iterations; if all do, check the cut-out for remaining background",
         ),
         Gate(
             "consistency",
@@ -163,7 +217,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             "",
             "share of the points seen from one side that the next view, 15 degrees further, does not contradict",
-            "the shape falls apart from other sides: raise static.iterations and static.views, or try another seed",
         ),
         Gate(
             "flicker",
@@ -172,7 +225,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             settings.flicker_most,
             "",
             "error of the changes from frame to frame; 0 is the video itself, 1 a frozen asset",
-            "raise motion.iterations, or smooth the deformation (deformation.smoothness_weight=0.01)",
         ),
         Gate(
             "floaters",
@@ -181,7 +233,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             settings.floaters_most,
             "",
             "share of the alpha that is disconnected from the subject, over sides and frames, minus the video's share",
-            "raise static.prune_opacity or mesh.min_component; remove specks from the cut-out",
         ),
         Gate(
             "flaws",
@@ -191,7 +242,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             "",
             "share of defects per triangle: open or non-manifold edges, degenerate or inverted triangles; defects that "
             "your own model already has do not count",
-            "use mesh.source=gaussians with another mesh.density_threshold or a larger mesh.grid",
         ),
         Gate(
             "folds",
@@ -201,7 +251,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             "",
             "share of triangles that cross others, are flipped or folded, in the worst frame; visible as dark creases "
             "under light; those that your own model has at rest do not count",
-            "use mesh.mode=per_frame for complex motions, or a smaller mesh.grid",
         ),
         Gate(
             "agreement",
@@ -210,8 +259,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             None,
             "",
             "overlap of the silhouettes of mesh and splats, over sides and frames",
-            "use mesh.source=gaussians with a lower mesh.density_threshold for thin parts, or mesh.mode=per_frame for "
-            "complex motions",
         ),
         Gate(
             "sharpness",
@@ -220,7 +267,6 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             settings.sharpness_most,
             "",
             "color gradients inside the subject, relative to the input image; low: blurred, high: noisy",
-            "if low, raise mesh.texture_size, mesh.render_size or static.iterations; if high, lower static.color_lr",
         ),
         Gate(
             "motion",
@@ -229,9 +275,20 @@ def evaluate_gates(inputs: GateInputs, settings: GateSettings) -> list[Gate]:
             settings.motion_most,
             "",
             "amount of change from frame to frame, relative to the video; near 0: frozen",
-            "if too low, raise motion.iterations; if too high, lower motion.plane_lr or motion.network_lr",
         ),
     ]
+    advice = _OWN_MODEL if inputs.own_model else _PER_FRAME if inputs.per_frame else _TRACKED
+    return [gate if gate.passed else replace(gate, advice=_advice_on(gate, advice)) for gate in gates]
+
+
+def _advice_on(gate: Gate, advice: _Advice) -> str:
+    """Return the remedy of a failed gate, for the forms that fail on the side of the worst value."""
+    side = gate.side(gate.value)
+    found = advice.get((gate.name, side), "")  # no side if a value is not a number
+    if isinstance(found, str):
+        return found
+    forms = [form for form, value in gate.values.items() if gate.side(value) == side]
+    return found[forms[0]] if len(forms) == 1 else "; ".join(f"{form}: {found[form]}" for form in forms)
 
 
 def fidelity(images: RgbaImages, video: RgbaImages) -> Float[Tensor, " b"]:

@@ -29,7 +29,7 @@ from dg4d_lib.images import resize
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments, interpolate, rasterize_mesh
-from dg4d_lib.settings import TextureSettings
+from dg4d_lib.refiner_settings import TextureSettings
 from dg4d_lib.texture.refiner import Refiner
 from dg4d_lib.video.driving import DrivingVideo
 

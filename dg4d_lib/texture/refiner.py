@@ -15,7 +15,7 @@ from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, start_inde
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import ConditionedZero123
 from dg4d_lib.images import resize
-from dg4d_lib.settings import ImageToImageSettings, VideoToVideoSettings
+from dg4d_lib.refiner_settings import ImageToImageSettings, VideoToVideoSettings
 
 
 @runtime_checkable
@@ -40,6 +40,19 @@ class Refiner(Protocol):
         ...
 
 
+def noise_levels(settings: VideoToVideoSettings, progress: float) -> tuple[float, ...]:
+    """Return the noise levels of one refinement, the largest first, and a final 0.
+
+    Args:
+        settings: number of steps, and the strength in the first and in the last iteration.
+        progress: 0 in the first iteration of the texture optimization, 1 in the last.
+    """
+    strength, steps = settings.strength, settings.model.num_inference_steps
+    if settings.strength_end:
+        strength += progress * (settings.strength_end - strength)
+    return karras_sigmas(steps)[start_index(steps, strength) :]
+
+
 class VideoToVideo:
     """SDEdit-style refiner: adds noise to the video and denoises it with Stable Video Diffusion.
 
@@ -47,16 +60,14 @@ class VideoToVideo:
     """
 
     def __init__(self, settings: VideoToVideoSettings, model: VideoModel, picture: Float[Tensor, "h w 3"]) -> None:
-        """Create the noise schedule.
+        """Store settings, model and picture.
 
         Args:
-            settings: number of steps and `strength`, the share of the schedule that is used.
+            settings: number of steps, and the share of the schedule that an iteration uses.
             model: Stable Video Diffusion, loaded.
             picture: the input picture over white, in [0, 1].
         """
-        self.model = model
-        steps = settings.model.num_inference_steps
-        self.sigmas = karras_sigmas(steps)[start_index(steps, settings.strength) :]
+        self.settings, self.model = settings, model
         self._picture = picture
 
     def refine(
@@ -66,11 +77,12 @@ class VideoToVideo:
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, "t h w 3"]:
-        """Return the denoised video; `cameras` and `progress` are not used."""
+        """Return the denoised video; `cameras` are not used."""
+        sigmas = noise_levels(self.settings, progress)
         condition = self.model.encode_condition(resize(self._picture[None], video.shape[1:3])[0], [generator])
         latents = self.model.encode(video)[None]
-        noisy = latents + self.sigmas[0] * self.model.sample_noise(latents.shape, [generator])
-        return self.model.decode(self.model.denoise(noisy, condition, self.sigmas)[0]).to(video)
+        noisy = latents + sigmas[0] * self.model.sample_noise(latents.shape, [generator])
+        return self.model.decode(self.model.denoise(noisy, condition, sigmas)[0]).to(video)
 
 
 class ImageToImage:

@@ -3,6 +3,7 @@
 Names choose entries; the others keep their files and times. Packages lie in out/gallery.
 """
 
+import argparse
 import json
 import math
 import sys
@@ -104,7 +105,13 @@ ENTRIES = (
 
 def main(arguments: Sequence[str]) -> None:
     """Make the chosen entries, or all, and write the page."""
-    chosen = [entry for entry in ENTRIES if not arguments or entry.name in arguments]
+    parser = argparse.ArgumentParser(prog="python -m examples.gallery.make_gallery", description=__doc__)
+    names = [entry.name for entry in ENTRIES]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"entries to make again: {', '.join(names)}")
+    wanted = parser.parse_args(arguments).names
+    if unknown := [name for name in wanted if name not in names]:
+        parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(names)}")
+    chosen = [entry for entry in ENTRIES if not wanted or entry.name in wanted]
     results = read_results()
     for entry in chosen:
         results[entry.name] = make_entry(entry)

@@ -49,7 +49,7 @@ def batch(request: CatalogRequest, console: "Console", allow: Callable[[Item], N
 
         progress = BatchProgress(len(items), show)
         try:
-            _convert(request, items, progress, allow)
+            _convert(request, items, progress)
         finally:
             stopped = (Row(item=item.name, status="skipped", message="not started, or stopped") for item in items)
             rows = [progress.rows.get(row.item, row) for row in stopped]
@@ -74,9 +74,7 @@ def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
     return exit_status_of(row.kind for row in rows)
 
 
-def _convert(
-    request: CatalogRequest, items: list[Item], progress: BatchProgress, allow: Callable[[Item], None] | None
-) -> None:
+def _convert(request: CatalogRequest, items: list[Item], progress: BatchProgress) -> None:
     """Skip finished items without a server, then run the catalog from the first unfinished one."""
     for item in items:
         first = ready(item, request.out, request.strict)
@@ -88,5 +86,5 @@ def _convert(
         convert.connect()
         from flows.catalog import run_catalog
 
-        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", progress, allow)
+        run_catalog(request, f"{Path(request.inputs).name}: {len(items)} items", progress, items)
         return

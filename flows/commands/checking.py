@@ -31,7 +31,7 @@ def score(
         typer.Option("-o", "--out", metavar="FILE", help="also write the results, as Markdown (.md) or as JSON"),
     ] = None,
 ) -> None:
-    """Score an asset and two trivial baselines against ground truth."""
+    """Score an asset and three baselines against ground truth."""
     with exit_on_error():
         from flows.commands import terminal
         from flows.commands.benchmark import score as score_asset

@@ -9,6 +9,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -129,9 +130,22 @@ def _describe(error: Exception) -> tuple[str, int]:
         case StepError():
             return str(error), EXIT_FAILED
         case OSError() if error.errno in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
-            advice = "choose another path" if error.errno in UNREACHABLE else "free some space and try again"
+            advice = "free some space and try again" if error.errno in NO_SPACE else "choose another path"
+            if error.errno == errno.EROFS and (variable := _variable_of(str(error.filename))):
+                advice = f"name a writable folder in ${variable}"
             return f"{error.strerror}: {error.filename or 'the disk'}; {advice}", EXIT_BAD_INPUT
     return f"internal error ({type(error).__name__}: {error}); traceback: {_save_traceback(error)}", EXIT_FAILED
+
+
+def _variable_of(path: str) -> str:
+    """Return the environment variable that names the folder of a path; empty if none does."""
+    from steps.store.files import FOLDER_VARIABLES, home
+
+    given = {name: Path(folder) for name in FOLDER_VARIABLES if (folder := os.environ.get(name))}
+    folders = {"DG4D_HOME": home()} | given
+    holding = {name: len(folder.parts) for name, folder in folders.items() if Path(path).is_relative_to(folder)}
+    to_create = "DG4D_HOME" if home().is_relative_to(path) else ""
+    return max(holding, key=holding.__getitem__, default=to_create)
 
 
 def _save_traceback(error: Exception) -> str:

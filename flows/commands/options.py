@@ -84,12 +84,16 @@ Cameras = Annotated[
     typer.Option(
         "--cameras",
         metavar="FILE",
-        help="transforms.json of nerfstudio with pictures of one moment, or synchronized videos; the camera of PICTURE "
-        "has its file name, or is the first",
+        help="transforms.json of nerfstudio with pictures of one moment, or synchronized videos; the camera "
+        "whose file is PICTURE (by path, or by a unique name) is the input camera; otherwise the first",
     ),
 ]
 Triangles = Annotated[
-    int | None, typer.Option(metavar="N", help="maximum number of triangles; short for --set mesh.max_faces=N")
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="maximum number of triangles; short for --set mesh.max_faces=N; a mesh given by --asset keeps its own",
+    ),
 ]
 Texture = Annotated[
     int | None,

@@ -1,7 +1,8 @@
 """Leases of running conversions on artifacts of a store, and the lock of the garbage collection.
 
 running/KEY.json    lease of an item that is being converted
-collecting/         lock, present while `dg4d store gc` removes artifacts
+collecting.lock     in a folder: empty file, locked by the kernel while `dg4d store gc` removes artifacts
+collecting/         in an object store: lock, present during that time
 """
 
 import hashlib
@@ -16,11 +17,13 @@ from pathlib import PurePosixPath
 from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
-from flows.processes import OWN_START, host_id, start_of
+from flows.processes import OWN_START, host_id, locked, start_of
 from steps.contract import Digest, Frozen
 from steps.store.artifact_store import ArtifactStore, Entry
 
 FOLDER = "running"
+FOLDER_LOCK = "collecting.lock"  # without content, which a full disk could not take
+FOLDER_LOCK_S = 1.0  # those who look hold the lock for a moment
 LOCK = "collecting/lock.json"
 LOCK_S = 900.0  # a lock of another machine is stale if it is not refreshed for so long
 POLL_S = 0.2
@@ -134,12 +137,16 @@ def collecting(store: ArtifactStore) -> Iterator[Callable[[], None]]:
         BadInput: another process holds it.
         StoreUnreachable: the store does not answer.
     """
+    if store.is_folder:
+        with locked(store.root / FOLDER_LOCK, patience_s=FOLDER_LOCK_S) as free:
+            if not free:
+                raise _already_collecting(store)
+            yield lambda: None
+        return
     text = Collecting(token=uuid.uuid4().hex).model_dump_json()
     while not store.create(LOCK, text) and store.read(LOCK) != text.encode():  # a retried request finds its own lock
         if _is_collecting(store):
-            raise BadInput(
-                f"another `dg4d store gc` is removing artifacts from {store.address}; try again when it has ended"
-            )
+            raise _already_collecting(store)
         store.remove([LOCK])
     try:
         yield lambda: store.write(LOCK, text)
@@ -177,8 +184,15 @@ def _read(store: ArtifactStore, entry: Entry) -> Lease | None:
         return None
 
 
+def _already_collecting(store: ArtifactStore) -> BadInput:
+    return BadInput(f"another `dg4d store gc` is removing artifacts from {store.address}; try again when it has ended")
+
+
 def _is_collecting(store: ArtifactStore) -> bool:
     """Return true if a live process holds the lock."""
+    if store.is_folder:
+        with locked(store.root / FOLDER_LOCK, shared=True) as free:
+            return not free
     if (content := store.read(LOCK)) is None:
         return False
     written = next((entry.modified for entry in store.entries(PurePosixPath(LOCK).parent.as_posix())), None)

@@ -19,7 +19,7 @@ from prefect.filesystems import LocalFileSystem
 from prefect.logging import get_run_logger
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.tasks import Task, exponential_backoff
-from prefect.transactions import IsolationLevel
+from prefect.transactions import IsolationLevel, Transaction
 
 from dg4d_lib.errors import DG4DError
 from flows import home
@@ -87,15 +87,20 @@ def finished_steps() -> list[StepRun]:
 
 @contextmanager
 def steps_of_flow() -> Iterator[None]:
-    """Label the current flow run with its process; kill its steps if the user stops it."""
+    """Label the current flow run with its process; kill its steps if the user stops it.
+
+    At the end, the background server is started again if it was killed: Prefect then tries for minutes to set the state
+    of the run.
+    """
     flow_run = UUID(runtime.flow_run.id)
-    claim_run()
     try:
+        claim_run()
         yield
     except (KeyboardInterrupt, TerminationSignal):
         stop_all()  # Prefect waits for tasks in other threads
         raise
     finally:
+        revive()
         _finished.pop(flow_run, None)
 
 
@@ -104,6 +109,8 @@ def flow_context(settings: Mapping[Any, Any] | None = None) -> Iterator[None]:
     """Keep records of results under `$DG4D_HOME`, and send no heartbeat: one delays the end of a flow run by a second.
 
     A flow takes the storage of its results from the flow that calls it, so the current flow run gets that storage too.
+    The transaction of a calling task, such as that of an item of a catalog, is hidden: steps would be recorded, and
+    their locks freed, only when that task ends.
 
     Args:
         settings: further settings of Prefect.
@@ -113,6 +120,7 @@ def flow_context(settings: Mapping[Any, Any] | None = None) -> Iterator[None]:
     changes = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOCAL_STORAGE_PATH: records}
     with ExitStack() as contexts:
         contexts.enter_context(temporary_settings({**changes, **(settings or {})}))
+        contexts.callback(Transaction.__var__.reset, Transaction.__var__.set(None))  # type: ignore[arg-type]
         if current := FlowRunContext.get():
             storage = {"result_storage": LocalFileSystem(basepath=str(records))}
             store = current.result_store.model_copy(update=storage)

@@ -1,7 +1,7 @@
 """Conversion requests by path, and conversion jobs by content."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,17 @@ from dg4d_lib.rasterizer.backends import backend_name, require_backend
 from flows.inputs import models, naming, sources
 from flows.inputs.given_views import ViewsRequest
 from flows.inputs.signing_key import certificate_digest
+from steps.catalog import STEPS
 from steps.contract import LARGEST_SEED, ArtifactRef, Frozen, digest_of
-from steps.profiles import PipelineSettings, profile
+from steps.profiles import PipelineSettings, is_read, profile
 from steps.runtime.installed_code import catalog, request_version
 from steps.runtime.weights import identities, license_of, require_weights, weights_in, without_paths
 from steps.sources.media_types import is_video
 from steps.store.artifact_store import ArtifactStore
 
 LONGEST_NAME = 60  # characters of a name made from a prompt
+SHAPE_STEPS = {"draw_picture", "prepare_views", "generate_views", "fit_gaussians", "fit_motion"}  # not with `--asset`
+MESH_STEPS = {"plan_mesh", "extract_mesh"}  # not with a mesh as `--asset`
 NAMES = {"item", "profile", "source_name", "picture_name"}  # for people; not part of the digest
 
 
@@ -74,7 +77,19 @@ class ConversionRequest(Frozen):
             found.append(f"{self.picture.name} only names the asset: the subject is that of {self.video.name}")
         if self.has_motion and self.settings.driving != profile(self.profile).driving:
             found.append(f"driving.* settings have no effect: the motion is that of {self.source_name}")
+        if self.asset is not None and (names := self._unread(self.asset)):
+            found.append(f"settings without an effect: {', '.join(names)}; {self.asset.name} keeps its own shape")
         return found
+
+    def _unread(self, asset: Path) -> list[str]:
+        """Return the changed settings that no step reads if the user's own model is animated; whole sections as `*`."""
+        steps = STEPS.keys() - SHAPE_STEPS - (set() if models.holds_splats(asset) else MESH_STEPS)
+        before = dict(_leaves(profile(self.profile).model_dump(mode="json")))
+        now = dict(_leaves(self.settings.model_dump(mode="json")))
+        read = {name.partition(".")[0] for name in now if is_read(name, steps)}
+        changed = [name for name, value in now.items() if before.get(name) != value and not is_read(name, steps)]
+        sections = [(name, name.partition(".")[0]) for name in changed]
+        return list(dict.fromkeys(name if section in read else f"{section}.*" for name, section in sections))
 
     def check(self) -> None:
         """Validate the request before any work.
@@ -360,6 +375,15 @@ def job_from_record(
             "--view, --turntable or --cameras"
         )
     return job
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested settings with their dotted names."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def name_from_text(text: str) -> str:

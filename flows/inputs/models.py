@@ -23,6 +23,7 @@ MOST_REFERENCES = 256  # files that a model may refer to
 LARGEST_TEXT_BYTES = 256 * 2**20  # of a glTF or MTL, which is searched for references
 PLY_HEADER_BYTES = 65536
 _PLY_TEXTURE = re.compile(r"^comment TextureFile\s+(.+?)\s*$", re.MULTILINE)
+_PLY_FACES = re.compile(r"^element face 0*[1-9]", re.MULTILINE)
 _MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
 
 
@@ -70,6 +71,12 @@ def put_model(path: Path, store: ArtifactStore) -> ArtifactRef:
     return put_zip(files, ASSET.media_type, store)
 
 
+def holds_splats(path: Path) -> bool:
+    """Return true for splats, false for a mesh: of PLY files, those that declare no faces are splats."""
+    suffix = path.suffix.lower()
+    return suffix == ".spz" or (suffix == ".ply" and not _PLY_FACES.search(_ply_header(path)))
+
+
 def _references(path: Path, suffix: str) -> Iterator[str]:
     """List the files that a glTF, an OBJ or a PLY refers to."""
     if suffix == ".gltf":
@@ -82,8 +89,12 @@ def _references(path: Path, suffix: str) -> Iterator[str]:
                 resolve_inside(path.parent, name, "the file of the model")
                 yield from _textures(materials)
     elif suffix == ".ply":
-        with path.open("rb") as file:
-            yield from _PLY_TEXTURE.findall(file.read(PLY_HEADER_BYTES).decode("utf-8", "replace"))
+        yield from _PLY_TEXTURE.findall(_ply_header(path))
+
+
+def _ply_header(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(PLY_HEADER_BYTES).decode("utf-8", "replace")
 
 
 def _textures(file: Path) -> Iterator[str]:

@@ -79,11 +79,9 @@ def check_names(names: Iterable[str]) -> None:
     Raises:
         BadInput: suggests the nearest name.
     """
-    known = {one.name for one in all_settings()}
-    sections = {name.rpartition(".")[0] for name in known} | {name.split(".")[0] for name in known}
     for name in names:
-        if name not in known and name not in sections and name not in RENAMED_SETTINGS:
-            raise BadInput(f"unknown setting {quoted(name)}; {_advice(name, sorted(known))}")
+        if name not in _names() and name not in _sections() and name not in RENAMED_SETTINGS:
+            raise BadInput(f"unknown setting {quoted(name)}; {_advice(name, sorted(_names()))}")
 
 
 def check_changes(changes: Mapping[str, Any]) -> None:
@@ -93,10 +91,11 @@ def check_changes(changes: Mapping[str, Any]) -> None:
         BadInput: suggests the nearest name, or a setting of the group.
     """
     check_names(changes)
-    names = {one.name for one in all_settings()}
     for name, value in changes.items():
+        if name in _names() or isinstance(value, dict):
+            continue
         members = [one for one in all_settings() if one.name.startswith(f"{name}.")]
-        if name in names or not members or isinstance(value, dict):
+        if not members:
             continue
         takers = [one.name for one in (*members, *all_settings()) if value in one.allowed.split(", ")]
         example = f"{takers[0]}={value}" if takers else f"{members[-1].name}={members[-1].default}"
@@ -108,6 +107,16 @@ def check_changes(changes: Mapping[str, Any]) -> None:
 def as_json(value: Any) -> str:
     """Return a value as `--set` takes it: JSON on one line, without spaces."""
     return json.dumps(value, separators=(",", ":"))
+
+
+@cache
+def _names() -> frozenset[str]:
+    return frozenset(one.name for one in all_settings())
+
+
+@cache
+def _sections() -> frozenset[str]:
+    return frozenset(part for name in _names() for part in (name.rpartition(".")[0], name.split(".")[0]))
 
 
 def _advice(name: str, known: list[str]) -> str:

@@ -11,7 +11,8 @@ from steps.store.files import home
 def background_server() -> Server:
     """Return the server that commands share unless PREFECT_API_URL names another."""
     make_private(home())
-    return Server(home() / "server", home() / "prefect")
+    folder = home() / "server"
+    return _used.get(folder) or Server(folder, home() / "prefect")
 
 
 def set_own_server(server: Server, address: str) -> None:

@@ -1,6 +1,9 @@
 """Results in the output folder of a watched folder: lines for packages that appear, and for failures."""
 
 import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +38,10 @@ class Results:
     def _stamps(self) -> dict[str, int]:
         """Return the times of the records of all packages by their folder."""
         found: dict[str, int] = {}
-        for path in self.out.rglob(RECORD):
-            name = path.parent.relative_to(self.out)
-            if not any(part.startswith(".") for part in name.parts):  # scratch folders of a publication
-                try:
-                    found[name.as_posix()] = path.stat().st_mtime_ns
-                except OSError:  # it is being replaced
-                    continue
+        for path in visible_files(self.out):
+            if path.name == RECORD:
+                with suppress(OSError):  # it is being replaced
+                    found[path.parent.relative_to(self.out).as_posix()] = path.stat().st_mtime_ns
         return found
 
     def _failed(self) -> dict[str, str]:
@@ -56,6 +56,16 @@ class Results:
         acceptance = _read(self.out / name / REPORT).get("acceptance")
         failing = acceptance.get("failing") if isinstance(acceptance, dict) else None
         return f" (not accepted: {', '.join(map(str, failing))})" if isinstance(failing, list) and failing else ""
+
+
+def visible_files(folder: Path) -> Iterator[Path]:
+    """Yield the files below a folder that are not hidden, nor below a hidden folder such as those of a publication.
+
+    Folders that vanish or cannot be read are left out.
+    """
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from (Path(parent, name) for name in names if not name.startswith("."))
 
 
 def _read(path: Path) -> dict[str, Any]:

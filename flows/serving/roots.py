@@ -43,7 +43,7 @@ class Roots(Frozen):
         Default of `$DG4D_SOURCES` is the current folder, which is new and empty in each run of a process worker; the
         default of `$DG4D_OUTPUTS` are the folders among the sources.
         """
-        sources = _places(os.environ.get(SOURCES) or str(Path.cwd()))
+        sources = _sources()
         outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
         granted = [*_of_studio(), *_granted()]
         return cls(
@@ -144,16 +144,19 @@ def environment(given: Iterable[str] = ()) -> dict[str, str]:
         given: folders or `s3://BUCKET/PREFIX`; default: `$DG4D_SOURCES`, else the current folder.
 
     Raises:
-        BadInput: one is not a folder, or contains the separator.
+        BadInput: one is not a folder, or its path contains the separator, also after links are resolved.
     """
     chosen = tuple(given)
     for place in chosen:
         if not place.startswith(BUCKET) and not Path(place).is_dir():
             raise BadInput(f"--sources {place} is not a folder; give one, or s3://BUCKET/PREFIX")
-        if SEPARATOR.search(place):
-            raise BadInput(f"--sources {place} contains {os.pathsep!r}, which separates folders; rename the folder")
-    sources = _resolved(chosen) or _places(os.environ.get(SOURCES) or str(Path.cwd()))
+    sources = _resolved(chosen) or _sources()
     outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
+    for place in (*sources, *outputs):
+        if SEPARATOR.search(place):
+            raise BadInput(
+                f"{place} contains {os.pathsep!r}, which separates folders; rename it, or give another as --sources"
+            )
     return {SOURCES: os.pathsep.join(sources), OUTPUTS: os.pathsep.join(outputs)}
 
 
@@ -195,6 +198,12 @@ def _granted() -> Iterator[Roots]:
 
 def _grants() -> Path:
     return background.background_server().folder / "grants"
+
+
+def _sources() -> tuple[str, ...]:
+    """Return the roots of `$DG4D_SOURCES`, else the current folder, whose path may contain the separator."""
+    given = os.environ.get(SOURCES)
+    return _places(given) if given else _resolved([str(Path.cwd())])
 
 
 def _places(text: str) -> tuple[str, ...]:

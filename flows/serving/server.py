@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import quote
 
+from dg4d_lib.errors import BadInput
 from flows.processes import die_with_parent, end, exit_guard, locked, python, spawn_guard, without_prefect
 from flows.serving import auth, database_template
 from steps.store.files import write_atomically
@@ -28,7 +29,8 @@ LOGIN = "/dg4d/login"
 START_TIMEOUT_S = 120.0
 STARTS = 3  # attempts with a server that exits
 GUARD_START_S = 20.0  # start of a bare interpreter
-IDLE_S = 1800.0  # time without a command before the server ends; $DG4D_SERVER_IDLE_S
+IDLE = "DG4D_SERVER_IDLE_S"  # variable: seconds without a command before the server ends
+IDLE_S = 1800.0  # its default
 LOOK_S = 1.0  # between two checks of the guard
 GRACE_S = 8.0  # between SIGTERM and SIGKILL
 
@@ -74,7 +76,12 @@ class Server:
         return self.folder / "server.log"
 
     def start(self) -> None:
-        """Start the server in the background unless it runs; it stays while this process uses it."""
+        """Start the server in the background unless it runs; it stays while this process uses it.
+
+        Raises:
+            BadInput: `$DG4D_SERVER_IDLE_S` is not a number of seconds.
+        """
+        _idle_s()  # its error would end the guard, which has only a log
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.auth_string()  # creates the secret
         if self._in_use is None:
@@ -218,7 +225,7 @@ def guard(folder: Path, prefect_home: Path) -> int:
         state = folder / "server.json"
         state.unlink(missing_ok=True)
         os.truncate(folder / "server.log", 0)
-        idle_s = float(os.environ.get("DG4D_SERVER_IDLE_S", IDLE_S))
+        idle_s = _idle_s()
         listener = _listener(state)
         port = int(listener.getsockname()[1])
         process = _serve(listener, folder, prefect_home)
@@ -230,6 +237,19 @@ def guard(folder: Path, prefect_home: Path) -> int:
         finally:
             state.unlink(missing_ok=True)
             end(process, GRACE_S)
+
+
+def _idle_s() -> float:
+    """Return the time without a command before the server ends.
+
+    Raises:
+        BadInput: the variable is not a number of seconds from 0 on.
+    """
+    given = os.environ.get(IDLE, "")
+    with suppress(ValueError):
+        if (seconds := float(given or IDLE_S)) >= 0:  # false for NaN
+            return seconds
+    raise BadInput(f"${IDLE} is {given!r}; set it to a number of seconds from 0 on, such as {IDLE_S:g}")
 
 
 def _watch(process: subprocess.Popen[bytes], folder: Path, idle_s: float) -> int:
@@ -272,9 +292,10 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
 
 
 def _listener(state: Path) -> socket.socket:
-    """Bind the last port, so that addresses stay valid, or else a free one.
+    """Listen on the last port, so that addresses stay valid, or else on a free one.
 
-    The guard keeps the socket, so no other process can take the port and receive the secret while the server starts.
+    The guard listens before the server starts and keeps the socket, so no other process can take the port and receive
+    the secret meanwhile. A port that is only bound can be taken: SO_REUSEADDR lets another user bind it too and listen.
     """
     before = 0
     with suppress(OSError, ValueError):
@@ -284,6 +305,7 @@ def _listener(state: Path) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((HOST, port))
+            listener.listen()  # connections wait until the server accepts them
         except (OSError, OverflowError):
             listener.close()
             continue

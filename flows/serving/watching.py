@@ -1,6 +1,8 @@
 """Watched folder: sends an event to the server when its files have changed and come to rest."""
 
 import hashlib
+import stat
+from contextlib import suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -9,6 +11,7 @@ from prefect.events import Event, Resource
 from prefect.exceptions import ObjectNotFound
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
+from flows.serving.results import visible_files
 from steps.contract import digest_of
 from steps.store.files import write_atomically
 
@@ -60,13 +63,13 @@ class Watcher:
 
     def _stamp(self) -> Stamps:
         stamps: Stamps = {}
-        for path in sorted(self.folder.rglob("*")):
-            name = path.relative_to(self.folder)
-            if self.out in (path, *path.parents) or any(part.startswith(".") for part in name.parts):
+        for path in sorted(visible_files(self.folder)):
+            if self.out in path.parents:
                 continue
-            if path.is_file() and not path.is_symlink():
-                facts = path.stat()
-                stamps[name.as_posix()] = (facts.st_size, facts.st_mtime_ns)
+            with suppress(OSError):  # it was removed meanwhile
+                facts = path.lstat()
+                if stat.S_ISREG(facts.st_mode):
+                    stamps[path.relative_to(self.folder).as_posix()] = (facts.st_size, facts.st_mtime_ns)
         return stamps
 
     def _content(self, name: str, size: int, modified: int) -> str:

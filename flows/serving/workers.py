@@ -128,6 +128,7 @@ def environment(api_url: str) -> dict[str, str]:
         "PREFECT_WORKER_QUERY_SECONDS": f"{QUERY_S:g}",
         "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S),
         "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "INFO",
+        "PREFECT_LOGGING_INTERNAL_LEVEL": "ERROR",
     }
 
 

@@ -110,7 +110,8 @@ class Pages:
         run = await self._api.run_into(str(made[1]), found.key) if made else None
         drafts = [tag.removeprefix("draft-") for tag in (run or {}).get("tags", ()) if tag.startswith("draft-")]
         gates = [
-            (gate, remedies(gate, made[0]) if made and run else []) for gate in (left.gates or {}).get("gates", ())
+            (gate, remedies(gate, made[0], left.version.steps) if made and run else [])
+            for gate in (left.gates or {}).get("gates", ())
         ]
         return _page(
             "asset.html",

@@ -20,6 +20,7 @@ from steps.contract import Frozen
 from steps.profiles import PROFILES
 from steps.runtime.environment_info import processor
 from steps.runtime.weights import weights_home, weights_in
+from steps.store.files import home
 
 NVIDIA_DRIVER = Path("/proc/driver/nvidia/version")
 MEMORY = Path("/proc/meminfo")
@@ -55,6 +56,7 @@ class Machine(Frozen):
         memory_gib: main memory.
         disk_free_gb: on the disk of the weights folder, units of 1e9 bytes.
         weights_folder: folder of all weights.
+        home_problem: reason why the home folder cannot be used; empty if it can.
         python: version.
         packages: versions of some packages; empty if not installed.
         gpus: those that the CUDA driver shows.
@@ -69,6 +71,7 @@ class Machine(Frozen):
     memory_gib: float
     disk_free_gb: float
     weights_folder: str
+    home_problem: str
     python: str
     packages: dict[str, str]
     gpus: tuple[Gpu, ...]
@@ -121,13 +124,13 @@ def examine_machine() -> Machine:
     """Return what this machine has; torch is started in another process, and only where there is a GPU."""
     gpus = tuple(Gpu(name=one.name, memory_gib=round(one.memory_bytes / GIB, 1)) for one in cuda_devices())
     folder = weights_home()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
     return Machine(
         processor=processor(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         memory_gib=_memory_gib(),
-        disk_free_gb=round(shutil.disk_usage(existing).free / 1e9, 1),
+        disk_free_gb=round(shutil.disk_usage(_existing(folder)).free / 1e9, 1),
         weights_folder=str(folder),
+        home_problem=_home_problem(home()),
         python=sys.version.split()[0],
         packages={name: _version(name) for name in SHOWN},
         gpus=gpus,
@@ -147,6 +150,7 @@ def examine_profile(name: str, machine: Machine) -> Readiness:
     no_gpu = bool(weights) and bool(machine.gpu_problem)
     size_gb = sum(one.about_gb or 0.0 for one in absent)
     lacks = [
+        *([machine.home_problem] if machine.home_problem else []),
         *(f"package {package}" for package in packages),
         *(f"weights {one.name}" + (" (damaged)" if one.state == "damaged" else "") for one in absent),
         *([f"GPU: {machine.gpu_problem}"] if no_gpu else []),
@@ -161,7 +165,7 @@ def examine_profile(name: str, machine: Machine) -> Readiness:
         *([SETUP_CUDA if weights else SETUP] if needs_setup else []),
         *([f"dg4d weights pull {name}"] if absent else []),
     ]
-    state: State = "missing" if packages or absent else "slow" if no_gpu else "ready"
+    state: State = "missing" if packages or absent or machine.home_problem else "slow" if no_gpu else "ready"
     return Readiness(
         profile=name,
         state=state,
@@ -181,6 +185,18 @@ def _weights_state(name: str) -> WeightsState:
         begun = (folder / folder_name(entry)).exists()
         state = "damaged" if begun and entry.name in read_lock(folder) else "missing"
     return WeightsState(name=name, state=state, about_gb=entry.about_gb)
+
+
+def _home_problem(folder: Path) -> str:
+    existing = _existing(folder)
+    if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
+        return ""
+    return f"a home folder: {folder} cannot be written; name another in $DG4D_HOME"
+
+
+def _existing(folder: Path) -> Path:
+    """Return a folder, or the nearest parent that exists."""
+    return next(path for path in (folder, *folder.parents) if path.exists())
 
 
 def _gpu_problem(shown: bool) -> str:

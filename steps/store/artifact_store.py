@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO, ClassVar, NamedTuple
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
 from steps.contract import ArtifactRef, is_digest
@@ -54,7 +54,12 @@ class ArtifactStore:
 
     Args:
         root: folder, made when the first file is put.
+
+    Attributes:
+        is_folder: whether `root` holds the files; else an object store does, and `root` has copies.
     """
+
+    is_folder: ClassVar[bool] = True
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root).absolute()
@@ -166,13 +171,23 @@ class ArtifactStore:
         write_atomically(self._new_file(name), text)
 
     def create(self, name: str, text: str) -> bool:
-        """Write a small file unless one of this name exists; return True for the one caller that wrote it."""
+        """Write a small file unless one of this name exists; return True for the one caller that wrote it.
+
+        Raises:
+            DiskFull: there is no room; no file is left.
+        """
         path = self._new_file(name)
-        try:
-            with room_for(path.parent), path.open("x", encoding="utf-8") as file:
-                file.write(text)
-        except FileExistsError:
-            return False
+        with room_for(path.parent):
+            try:
+                file = path.open("x", encoding="utf-8")
+            except FileExistsError:
+                return False
+            try:
+                with file:
+                    file.write(text)
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
         return True
 
     def remove(self, names: Sequence[str]) -> None:

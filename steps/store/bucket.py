@@ -51,6 +51,8 @@ class BucketStore(ArtifactStore):
         address: address that `open_store` opens.
     """
 
+    is_folder = False
+
     def __init__(self, bucket: "ObjectStore", copies: Path, address: str) -> None:
         super().__init__(copies)
         self._bucket = bucket

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 
+FOLDER_VARIABLES = ("DG4D_HOME", "DG4D_STORE", "DG4D_WEIGHTS")
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 
 
@@ -24,6 +25,14 @@ def home() -> Path:
         return Path(given).expanduser().absolute()
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return Path(data) / "dg4d"
+
+
+def make_folders_absolute() -> None:
+    """Make folders that environment variables name absolute: child processes have other current folders."""
+    for name in FOLDER_VARIABLES:
+        given = os.environ.get(name)
+        if given and "://" not in given:
+            os.environ[name] = str(Path(given).expanduser().absolute())
 
 
 @contextmanager

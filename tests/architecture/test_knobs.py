@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 
 import dg4d_lib.asset_settings
 import dg4d_lib.input_settings
+import dg4d_lib.refiner_settings
 import dg4d_lib.settings
 import steps.profiles
 from dg4d_lib.errors import BadInput
@@ -22,7 +23,14 @@ from dg4d_lib.settings import MotionSettings, Settings, StaticSettings
 from steps.catalog import STEPS
 from steps.profiles import PROFILES, PipelineSettings, profile, revise
 
-DEFINITIONS = {"dg4d_lib/settings.py", "dg4d_lib/asset_settings.py", "dg4d_lib/input_settings.py", "steps/profiles.py"}
+MODULES = (
+    dg4d_lib.settings,
+    dg4d_lib.input_settings,
+    dg4d_lib.asset_settings,
+    dg4d_lib.refiner_settings,
+    steps.profiles,
+)
+DEFINITIONS = {f"{module.__name__.replace('.', '/')}.py" for module in MODULES}
 EVIDENT = {  # numbers whose names say everything
     "iterations", "features", "hidden", "frequencies", "max_faces", "prune_opacity",
     "guidance_weight", "color_lr", "opacity_lr", "scale_lr", "rotation_lr",
@@ -33,8 +41,7 @@ Classes = Mapping[str, tuple[type[BaseModel], ...]]
 
 
 def settings_classes() -> list[type[Settings]]:
-    modules = (dg4d_lib.settings, dg4d_lib.input_settings, dg4d_lib.asset_settings, steps.profiles)
-    found = [value for module in modules for _, value in inspect.getmembers(module, inspect.isclass)]
+    found = [value for module in MODULES for _, value in inspect.getmembers(module, inspect.isclass)]
     own = {c for c in found if issubclass(c, Settings) and c is not Settings}
     return sorted(own - {base for c in own for base in c.__bases__}, key=lambda c: c.__name__)
 
@@ -44,7 +51,8 @@ def classes_by_name() -> Classes:
     names = {c.__name__: (c,) for c in settings_classes()}
     unions = {
         name: classes_in(value)
-        for name, value in {**vars(dg4d_lib.settings), **vars(dg4d_lib.input_settings)}.items()
+        for module in MODULES
+        for name, value in vars(module).items()
         if name.endswith("Settings")
     }
     bases = {"FitSettings": (StaticSettings, MotionSettings)}

@@ -9,7 +9,7 @@ from benchmarks.refinement import measure_textures, run_refinement, variants
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.settings import TextureSettings
+from dg4d_lib.refiner_settings import TextureSettings
 from dg4d_lib.video.driving import DrivingVideo
 
 FRAMES = 3
@@ -30,7 +30,8 @@ def test_every_variant_runs_and_gives_a_texture_per_frame(tmp_path: Path) -> Non
     asset, video = board()
     svd, zero123 = save_tiny_svd(tmp_path / "svd"), write_zero123(tmp_path / "zero123")
     chosen = variants(TEXTURE, str(svd), str(zero123))
-    for name in (next(iter(chosen)), "image to image"):
+    assert "video to video, 0.3 to 0.05" in chosen
+    for name in (next(iter(chosen)), "video to video, 0.3 to 0.05", "image to image"):
         after = run_refinement(asset, video, chosen[name], 0)
         assert after.textures is not None and after.textures.shape == (FRAMES, 8, 8, 3)
 

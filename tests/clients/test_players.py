@@ -13,7 +13,8 @@ from PIL import Image
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D, interpolate_frames
-from dg4d_lib.assets.formats.foreign_glb import MOTION, MOVES, read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.foreign_motion import MOTION, MOVES, write_moving_glb
 from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.assets.formats.rigged import write_rigged_glb
 from dg4d_lib.cameras.orbit import OrbitCamera

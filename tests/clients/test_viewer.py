@@ -329,6 +329,11 @@ def test_the_page_is_small() -> None:
     assert len(build_viewer_page("", b"", None, None, None, {}).encode()) < PAGE_BYTES
 
 
+def test_the_canvas_has_the_pixels_of_the_screen_that_the_window_is_on(tried: Try) -> None:
+    before, sharp, after = tried(write_glb(egg()), deeds=[["screen", 2], ["screen", 1]]).said["sizes"]
+    assert sharp == [2 * pixels for pixels in before] and after == before
+
+
 def test_the_driving_video_follows_the_clock(tried: Try, tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
     write_mp4(film, torch.linspace(0, 1, FRAMES)[:, None, None, None].expand(FRAMES, 32, 32, 3), FPS)

@@ -5,11 +5,12 @@
 //    "reducedMotion": "reduce" for users who ask for it,
 //    "shots": [{"show": mode, "time": seconds, "file": a PNG of the canvas, with alpha}, ...],
 //    "deeds": [["press", key] or ["drag", dx, dy] or ["wheel", dy] or ["wait", seconds] or ["focus", selector] or
-//    ["lose"] and restore the WebGL context while paused, after which the page looks the same, ...], "screenshot": file}
+//    ["lose"] and restore the WebGL context while paused, after which the page looks the same, or ["screen", pixels per
+//    point] of the one that the window moves to, ...], "screenshot": file}
 // Prints
 //   {"notice": text, "requests": addresses, "size": [width, height] of the canvas, "states": what dg4d.state() gives when
-//    the page is ready and after every deed, "drawn": digests of the picture at these moments, "video": its seconds,
-//    "facts": text of the panel}
+//    the page is ready and after every deed, "drawn": digests of the picture and "sizes" of the canvas at these moments,
+//    "video": its seconds, "facts": text of the panel}
 import { createHash } from "node:crypto";
 import { writeFile } from "node:fs/promises";
 import { pathToFileURL } from "node:url";
@@ -40,6 +41,14 @@ async function act(page, [deed, ...details]) {
     await page.waitForTimeout(500);
     if (!before.equals(await page.screenshot())) throw new Error("the picture is gone with the WebGL context");
   }
+  if (deed === "screen") {
+    const session = await page.context().newCDPSession(page);
+    const screen = { width, height, deviceScaleFactor: details[0], mobile: false };
+    await session.send("Emulation.setDeviceMetricsOverride", screen);
+    // An emulated screen, unlike a real one, lets queries change only when something else does.
+    for (const contrast of ["more", null]) await page.emulateMedia({ contrast });
+    await page.waitForTimeout(300);
+  }
   if (deed === "wheel") await canvas.hover().then(() => page.mouse.wheel(0, details[0]));
   if (deed === "drag") {
     const box = await canvas.boundingBox();
@@ -66,14 +75,13 @@ const result = await inBrowser({}, { width, height }, async (page) => {
   await page.emulateMedia({ reducedMotion });
   await page.goto(pathToFileURL(file).href);
   const ready = await page.evaluate(() => dg4d.ready.then(() => true, () => false));
-  const [states, drawn] = [[], []];
+  const [states, drawn, sizes] = [[], [], []];
   const note = async () => {
+    sizes.push(await page.evaluate(() => [document.querySelector("canvas").width, document.querySelector("canvas").height]));
     states.push(await page.evaluate(() => dg4d.state()));
     drawn.push(createHash("sha256").update(content(await picture(page))).digest("hex"));
   };
-  let size = null;
   if (ready) {
-    size = await page.evaluate(() => [document.querySelector("canvas").width, document.querySelector("canvas").height]);
     await note();
     for (const deed of deeds) {
       await act(page, deed);
@@ -88,7 +96,8 @@ const result = await inBrowser({}, { width, height }, async (page) => {
   return {
     notice: (await page.locator("#notice").isVisible()) ? await page.locator("#notice").innerText() : "",
     requests: requests.filter((url) => !/^(blob|data):/.test(url)),
-    size,
+    size: sizes[0] ?? null,
+    sizes,
     states,
     drawn,
     video: await page.evaluate(() => document.querySelector("video").currentTime),

@@ -61,6 +61,12 @@ def test_only_the_server_is_reached_from_outside_and_only_from_this_machine() ->
     }
 
 
+def test_only_workers_which_fetch_sources_and_weights_and_the_server_reach_the_internet() -> None:
+    assert COMPOSE["networks"] == {"inside": {"internal": True}, "outside": {}}
+    reach = {name for name, service in SERVICES.items() if service.get("networks", []) != ["inside"]} - {"volumes"}
+    assert reach == {"server", "worker-cpu", "worker-gpu"}
+
+
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_service_is_confined(name: str) -> None:
     service = SERVICES[name]

@@ -3,6 +3,7 @@
 import inspect
 import json
 import math
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,15 @@ def loading(monkeypatch: pytest.MonkeyPatch, alone: Path) -> None:
 def words(path: str, text: str) -> str:
     Path(path).write_text(picture(text))
     return path
+
+
+def test_processes_that_the_package_starts_get_absolute_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DG4D_HOME", "here")
+    assert dg4d.__getattr__("DG4DError")
+    assert os.environ["DG4D_HOME"] == str(tmp_path / "here")
 
 
 def test_a_picture_becomes_an_asset_and_the_second_call_does_nothing(alone: Path) -> None:

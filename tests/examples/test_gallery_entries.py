@@ -1,12 +1,15 @@
 """Gallery: its pictures are those that the code draws, and the page names what is there."""
 
 import re
+import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from examples.gallery import creatures, things
+from examples import make_examples
+from examples.gallery import creatures, make_gallery, things
 from examples.gallery.figures import Figure, Part, both_sides, box, disk, left_right, ring
 from examples.gallery.make_gallery import ENTRIES, FOLDER, PAGE, page, read_results
 from examples.gallery.pictures import octopus
@@ -31,6 +34,32 @@ def test_every_entry_has_a_picture_a_film_and_a_command_that_works(entry) -> Non
         assert still.size == (512, 512) and getattr(moving, "n_frames", 1) > 20
     revise(profile("preview"), parse_changes(list(entry.changes)))
     assert entry.picture in entry.command
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "code", "says"),
+    [
+        (make_gallery.main, ["--help"], 0, "elephant, robot"),
+        (make_gallery.main, ["elefant"], 2, "unknown: elefant; choose from elephant"),
+        (make_examples.main, ["--help"], 0, "Make every file of this folder again"),
+    ],
+)
+def test_help_and_wrong_names_make_nothing(
+    program: Callable[..., None], arguments: list[str], code: int, says: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def forbidden(*_: object) -> None:
+        raise AssertionError("something was made")
+
+    monkeypatch.setattr(make_gallery, "make_entry", forbidden)
+    monkeypatch.setattr(make_gallery, "PAGE", None)
+    monkeypatch.setattr(make_examples, "write_png", forbidden)
+    monkeypatch.setattr(sys, "argv", ["program", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        program(*([arguments] if program is make_gallery.main else []))
+    printed = capsys.readouterr()
+    assert ended.value.code == code
+    assert says in " ".join((printed.out + printed.err).split())
 
 
 def test_the_gallery_is_small_and_has_no_other_files() -> None:

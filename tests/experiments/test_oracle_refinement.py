@@ -3,9 +3,10 @@ import torch
 
 from benchmarks.ablations import Variant
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.diffusion.video_model import karras_sigmas
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import locate_texels
-from dg4d_lib.settings import TextureSettings
+from dg4d_lib.refiner_settings import TextureSettings
 from dg4d_lib.texture.refine import RefinedTextures
 from experiments import oracle_refinement
 from experiments.oracle_refinement import FLICKER, NOISE, VARIANTS, Model, Oracle, refine_model, score_model
@@ -27,7 +28,9 @@ def board() -> Model:
 
 
 def answer(model: Model, video: torch.Tensor, sigma: float, whole_videos: bool) -> torch.Tensor:
-    return Oracle(model, sigma, whole_videos).refine(video, FRONT, 0.0, torch.Generator().manual_seed(0))
+    return Oracle(model, lambda progress: sigma, whole_videos).refine(
+        video, FRONT, 0.0, torch.Generator().manual_seed(0)
+    )
 
 
 def test_without_noise_the_oracle_changes_nothing_and_with_all_of_it_the_answer_is_what_it_believes(
@@ -71,6 +74,20 @@ def test_the_loop_restores_what_the_oracle_knows(board: Model, monkeypatch: pyte
     assert refine_model(board, Variant(), settings, seed=0).texture is board.blurred
     assert after.psnr_obj > before.psnr_obj + 10
     assert before.flicker == 0 and after.flicker == 0  # one texture for all frames
+
+
+def test_the_noise_of_a_variant_falls_over_the_iterations(board: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[float]()
+
+    def refine(self: Oracle, video: torch.Tensor, cameras: object, progress: float, generator: object) -> torch.Tensor:
+        seen.append(self.sigma_at(progress))
+        return video
+
+    monkeypatch.setattr(Oracle, "refine", refine)
+    settings = TextureSettings(size=SIZE, iterations=3)
+    refine_model(board, VARIANTS["video to video, 0.3 to 0.05"], settings, seed=0)
+    levels = karras_sigmas(25)
+    assert seen == [levels[17], levels[20], levels[23]]
 
 
 def test_claims_are_about_variants_that_there_are() -> None:

@@ -303,7 +303,7 @@ VIDEOS: dict[str, Make] = {
     "mp4: uneven sizes": lambda: film(pixels="yuv444p", width=65, height=47),
     "mp4: 10 bits": lambda: film(codec="libx265", pixels="yuv420p10le", options=X265),
     "mp4: AV1": lambda: film(codec="libsvtav1", options=(("preset", "12"),)),
-    "mp4: 40 frames": lambda: film(count=40),
+    "mp4: 40 frames": lambda: film(count=40, width=160, height=160),
     "mp4: zip behind": lambda: film() + frames_zip(),
     "mov: ProRes with alpha": lambda: film("mov", "prores_ks", pixels="yuva444p10le", options=(("profile", "4"),)),
     "mkv: clusters of unknown size": lambda: film("matroska", "ffv1", pixels="bgra", muxer=(("live", "1"),)),

@@ -385,7 +385,7 @@ def test_a_plan_comes_back_with_every_bit_and_other_files_are_refused(tmp_path: 
 
 def test_a_mesh_per_frame_stands_where_the_cloud_is_then(tmp_path: Path) -> None:
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "per_frame"}), first_frame=1, end_frame=3)
-    assert facts.notes[1:] == ("2 of 2 meshes from frame 1 on bound solids",)
+    assert facts.notes[1:] == ("all 2 meshes of frames 1 to 2 are closed surfaces without defects",)
     meshes = read_meshes(tmp_path / "meshes")
     centers = torch.stack([(mesh.vertices.amax(0) + mesh.vertices.amin(0)) / 2 for mesh in meshes])
     torch.testing.assert_close(centers, torch.tensor([[2.0], [3.0]]) * SHIFT, atol=0.03, rtol=0)

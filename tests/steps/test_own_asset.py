@@ -139,6 +139,7 @@ def test_a_model_alone_becomes_its_own_subject(model_zip: Path, tmp_path: Path) 
     middle = subject[24:40, 24:40, :3].mean((0, 1))
     assert middle.argmax() == 1  # the green side is at azimuth 90
     assert any("render of the model" in note for note in report.notes)
+    assert any("(1 mesh part, " in note for note in report.notes)
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +174,7 @@ def test_the_note_tells_rigid_parts_from_a_surface_that_bends() -> None:
     turns = torch.tensor([[1.0, 0, 0, 0], [0.9, 0.1, 0, 0], [0.9, 0, 0.1, 0]])
     quats = turns[[0, 1, 1, 2, 2, 2]].expand(4, 6, 4)
     motion = NodeMotion(quats, torch.zeros(4, 6, 3), quats[:, 0], torch.zeros(4, 3))
-    assert "parts that the model moves as: 3" in animate_asset.motion_note(motion, 4)
+    assert "The model moves as 3 rigid parts;" in animate_asset.motion_note(motion, 4)
     assert animate_asset.motion_note(motion, 2) == animate_asset.NOTE
 
 

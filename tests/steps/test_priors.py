@@ -255,10 +255,11 @@ def test_the_report_tells_how_much_of_an_unsure_shape_is_inflated(
 
 
 def test_footage_and_hints_turn_every_prior(tmp_path: Path) -> None:
-    write_pose(tmp_path / "pose.json", Pose(turn_deg=12.0))
-    for settings, found in ((GeometricPriorSettings(), 12.0), (LearnedPriorSettings(), 16.0)):
-        assert subject_hint(settings, tmp_path / "pose.json", None, 0.0) == DepthHint(found)
-        assert subject_hint(settings, tmp_path / "pose.json", None, -5.0) == DepthHint(-5)
+    for settings, factor in ((GeometricPriorSettings(), 1), (LearnedPriorSettings(), 4 / 3)):
+        for shown, found in ((12.0, 12.0 * factor), (0.0, 0.0), (None, None)):
+            write_pose(tmp_path / "pose.json", Pose(turn_deg=shown))
+            assert subject_hint(settings, tmp_path / "pose.json", None, 0.0) == DepthHint(found)
+            assert subject_hint(settings, tmp_path / "pose.json", None, -5.0) == DepthHint(-5)
         assert subject_hint(settings, None, None, 0.0).says_nothing
 
 

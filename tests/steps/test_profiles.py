@@ -143,6 +143,17 @@ def test_the_same_kind_again_changes_nothing() -> None:
     assert revise(twelve, {"prior.kind": "zero123"}) == twelve
 
 
+@pytest.mark.parametrize(
+    ("changed", "again"),
+    [({"meshopt": True, "quality": 60}, False), ({"interpolation": "step"}, True), ({"moving_normals": False}, True)],
+)
+def test_only_options_that_the_motion_of_a_model_is_written_with_make_it_again(
+    changed: dict[str, object], again: bool
+) -> None:
+    revised = revise(PREVIEW, {f"pack.gltf.{name}": value for name, value in changed.items()})
+    assert (step_settings("animate_asset", revised) != step_settings("animate_asset", PREVIEW)) == again
+
+
 def test_a_step_gets_its_sections_and_values_of_the_run_and_nothing_else() -> None:
     turned = revise(PREVIEW, {"subject.turn_deg": 12.5})
     assert step_settings("drive_video", turned).model_dump() == {

@@ -16,7 +16,8 @@ from steps.runtime.readiness import Gpu, Machine, examine_machine, examine_profi
 from steps.runtime.weights import weights_in
 
 MACHINE = Machine(
-    processor="some", cores=2, memory_gib=16, disk_free_gb=100, weights_folder="w", python="3.11", packages={},
+    processor="some", cores=2, memory_gib=16, disk_free_gb=100, weights_folder="w", home_problem="",
+    python="3.11", packages={},
     gpus=(Gpu(name="A100", memory_gib=79.2),), driver="580.1", cuda="13.0", gpu_problem="", gsplat_kernels="compiled",
 )  # fmt: skip
 
@@ -43,6 +44,14 @@ def pulled(home: Path, name: str) -> Path:
 def test_the_preview_is_ready_on_any_machine() -> None:
     found = examine_profile("preview", MACHINE.model_copy(update={"gpus": (), "gpu_problem": "none"}))
     assert (found.state, found.lacks, found.command, found.gpu_gib) == ("ready", (), "", 0)
+
+
+def test_without_a_folder_that_can_be_written_nothing_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / "file" / "home"))
+    found = examine_profile("preview", examine_machine())
+    assert found.state == "missing"
+    assert found.lacks == (f"a home folder: {tmp_path}/file/home cannot be written; name another in $DG4D_HOME",)
 
 
 @pytest.mark.parametrize("name", sorted(set(PROFILES) - {"preview"}))

@@ -1,4 +1,5 @@
 import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from tiny_weights import write_scheduler, write_zero123
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
+from dg4d_lib.refiner_settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.media import write_frames
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
@@ -52,11 +53,9 @@ def refine(folder: Path, mode: str, refiner: RefinerSettings) -> StepReport:
     )
 
 
-def video_to_video(folder: Path, **changes: object) -> VideoToVideoSettings:
-    weights = save_tiny_svd(folder / "svd")
-    return VideoToVideoSettings(
-        texture={**TEXTURE, **changes}, model={"weights": str(weights), "num_inference_steps": 4}
-    )
+def video_to_video(folder: Path, strength_end: float = 0.0, **changes: object) -> VideoToVideoSettings:
+    model = {"weights": str(save_tiny_svd(folder / "svd")), "num_inference_steps": 4}
+    return VideoToVideoSettings(texture={**TEXTURE, **changes}, model=model, strength_end=strength_end)
 
 
 @pytest.mark.parametrize("mode", ["tracked", "meshes"])
@@ -80,6 +79,11 @@ def test_video_diffusion_sees_all_frames_as_one_video(folder: Path, mode: str, m
         assert red > 0.53 and green < 0.47
     assert facts.backend == "cpu (diffusers)" and any("unet" in name for name in facts.weights) and facts.licenses
     assert "every 2 iterations" in facts.notes[0] and "2 steps" in facts.notes[0]
+
+
+def test_the_report_says_how_the_noise_was_annealed(folder: Path) -> None:
+    (note,) = refine(folder, "tracked", video_to_video(folder, strength_end=0.05)).notes
+    assert re.search(r"on, 2 steps \(in the last iteration from sigma 0\.002 on, 1 steps\);", note)
 
 
 def test_every_frame_of_a_tracked_mesh_may_add_its_own(folder: Path) -> None:

@@ -1,6 +1,7 @@
 import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from steps.contract import ArtifactRef
 from steps.store import artifact_store as module
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
-from steps.store.files import DiskFull, home, write_atomically
+from steps.store.files import DiskFull, home, make_folders_absolute, write_atomically
 
 
 @pytest.fixture
@@ -96,6 +97,15 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(
     assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["state"]
 
 
+def test_a_new_file_that_there_is_no_room_for_is_not_created(
+    store: ArtifactStore, no_room: AbstractContextManager[None]
+) -> None:
+    store.write("a/one.json", "1")
+    with no_room, pytest.raises(OSError, match="too large"):
+        store.create("a/two.json", "2")
+    assert [path.name for path in files_in(store)] == ["one.json"]
+
+
 def test_another_trouble_with_a_file_is_not_called_a_full_disk(store: ArtifactStore, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         store.put(tmp_path / "nothing", "a/b")
@@ -107,6 +117,20 @@ def test_home_is_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.delenv("DG4D_HOME")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "x"))
     assert home() == tmp_path / "x" / "dg4d"
+
+
+@pytest.mark.parametrize(
+    ("given", "then"),
+    [("a/b", "{here}/a/b"), ("/a", "/a"), ("~/a", "/me/a"), ("s3://bucket/p", "s3://bucket/p"), ("", "")],
+)
+def test_folders_of_the_environment_are_the_same_for_processes_in_other_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, then: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/me")
+    monkeypatch.setenv("DG4D_STORE", given)
+    make_folders_absolute()
+    assert os.environ["DG4D_STORE"] == then.format(here=tmp_path)
 
 
 def test_threads_that_write_one_file_at_once_leave_one_whole_content(tmp_path: Path) -> None:

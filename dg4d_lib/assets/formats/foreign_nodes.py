@@ -12,6 +12,7 @@ from dg4d_lib.errors import BadInput
 MAX_NODES = 100_000
 MAX_DEPTH = 200  # of nested nodes
 MAX_GROUPS = 4  # of four joints per vertex
+FLAT = 1e-9  # determinant of a matrix that cannot be inverted, relative to the cube of its norm
 
 Matrices = dict[int, NDArray[np.float64]]  # "4 4" per node
 
@@ -117,3 +118,18 @@ def skin_weights(reader: GlbReader, attributes: dict[str, int]) -> tuple[NDArray
     share = total.sum(1, keepdims=True)
     broken = np.abs(share) < 1e-6
     return np.concatenate(indices, 1).astype(np.int64), np.where(broken, 0, total / np.where(broken, 1, share))
+
+
+def flattening(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which matrices flatten what they move; small ones need not, as of quantized meshes."""
+    linear = matrices[:, :3, :3]
+    flat: NDArray[np.bool_] = np.abs(np.linalg.det(linear)) <= FLAT * np.linalg.norm(linear, axis=(1, 2)) ** 3
+    return flat
+
+
+def transform_points(matrices: NDArray[np.float64], points: NDArray[Any]) -> NDArray[np.float64]:
+    """Apply one affine matrix, or one per point."""
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
+    if len(matrices) == 1:
+        return (homogeneous @ matrices[0].T)[:, :3]
+    return np.einsum("vij,vj->vi", matrices, homogeneous)[:, :3]

@@ -10,7 +10,7 @@ def place_moving_glb(content: bytes, placement: Placement, slowdown: float) -> b
     """Move a model in motion, and change its duration; its keys and all else are kept.
 
     Args:
-        content: GLB of `write_moving_glb`, whose scene has one root node with a matrix.
+        content: GLB of `write_moving_glb`; the first root node of its scene has a matrix that places the model.
         placement: from the coordinates of the fit to meters.
         slowdown: factor on the times of the keys.
 
@@ -22,7 +22,7 @@ def place_moving_glb(content: bytes, placement: Placement, slowdown: float) -> b
     """
     reader = GlbReader(content)
     tree, binary = reader.tree, bytearray(reader.binary)
-    (root,) = tree["scenes"][tree.get("scene", 0)]["nodes"]
+    root, *_ = tree["scenes"][tree.get("scene", 0)]["nodes"]
     columns = np.array(tree["nodes"][root]["matrix"]).reshape(4, 4)
     columns[:, :3] *= placement.scale
     columns[3, :3] += placement.translation

@@ -228,6 +228,11 @@ def padded_rows(rows: NDArray[Any]) -> NDArray[Any]:
     return np.pad(rows, ((0, 0), (0, missing))) if missing else rows
 
 
+def json_object(value: Any) -> dict[str, Any]:
+    """Return a value of the tree if it is a JSON object, else an empty one."""
+    return value if isinstance(value, dict) else {}
+
+
 def read_accessor(reader: GlbReader, index: int, raw: bool = False) -> NDArray[Any]:
     """Return the rows of an accessor; floats, or with `raw` the stored integers.
 

@@ -17,7 +17,10 @@ def write_model_glb(model: Model) -> bytes:
     nodes = []
     for part in model.parts:
         attributes = {"POSITION": document.add_accessor(part.name, part.vertices.astype("<f4"), VERTEX_DATA)}
-        shading: dict[str, object] = {"baseColorFactor": [*part.factor, 1.0], "metallicFactor": 0.0}
+        shading: dict[str, object] = {
+            "baseColorFactor": [*_colors(np.array(part.factor)).tolist(), 1.0],
+            "metallicFactor": 0.0,
+        }
         if part.uvs is not None:
             uvs = document.add_accessor(f"{part.name} uvs", _numbers(part.uvs), VERTEX_DATA)
             attributes["TEXCOORD_0"] = uvs
@@ -26,7 +29,7 @@ def write_model_glb(model: Model) -> bytes:
                 textures[id(part.texture)] = _add_texture(document, part.name, part.texture)
             shading["baseColorTexture"] = {"index": textures[id(part.texture)]}
         if part.colors is not None:
-            colors = document.add_accessor(f"{part.name} colors", _numbers(part.colors), VERTEX_DATA)
+            colors = document.add_accessor(f"{part.name} colors", _colors(part.colors), VERTEX_DATA)
             attributes["COLOR_0"] = colors
         mode = "MASK" if part.masked else None
         material = document.add(
@@ -44,6 +47,11 @@ def _numbers(values: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return float32; what is no number or too large would break the file, and becomes 0 or the largest one."""
     with np.errstate(over="ignore"):
         return np.nan_to_num(values.astype("<f4"))
+
+
+def _colors(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return float32 in [0, 1], as glTF demands of colors."""
+    return _numbers(values).clip(0, 1)
 
 
 def _add_texture(document: GltfDocument, name: str, pixels: NDArray[np.uint8]) -> int:

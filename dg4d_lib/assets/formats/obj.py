@@ -15,6 +15,7 @@ from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
 Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 _CONTINUED = re.compile(r"\\\r?\n")  # a backslash at the end of a line
+FLOAT_COLORS = 2.0  # largest color of a file with floats, which may exceed 1 a little; others have colors of 0 to 255
 _NAMING = ("o", "g", "usemtl", "mtllib")  # statements of names, where "#" begins no comment
 
 
@@ -110,6 +111,8 @@ class _Content:
         colored = np.array(self.colors, float) if all(len(row) == 3 for row in self.colors) else None
         if colored is not None and not np.isfinite(colored).all():
             colored = None
+        if colored is not None and colored.max() > FLOAT_COLORS:
+            colored = colored / 255
         coordinates = np.array([*self.uvs, (0.0, 1.0)])  # the last one, at index -1, is 0 0 of the file, as in players
         unknown = Material() if colored is None else Material((1.0, 1.0, 1.0))
         pictures: dict[str, NDArray[np.uint8]] = {}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Ar, Gf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Ar, Gf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart
@@ -96,10 +96,20 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
                 "limit with --set asset.max_faces=N"
             )
     if not parts:
-        raise BadInput("the USD file shows no triangles; give a mesh with faces")
+        raise BadInput(_no_mesh(stage))
     if not all(np.isfinite(part.vertices).all() for part in parts):
         raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
     return Model(tuple(parts))
+
+
+def _no_mesh(stage: Usd.Stage) -> str:
+    """Return what to do about a file without triangles."""
+    if any(prim.IsA(UsdVol.ParticleField) for prim in stage.Traverse()):
+        return (
+            "the USD file shows splats and no mesh; splats are read from PLY and SPZ: give one of these, such as "
+            "splats/000.ply of a dg4d package, or its mesh, asset.usdz"
+        )
+    return "the USD file shows no triangles; give a mesh with faces"
 
 
 def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:
@@ -121,12 +131,13 @@ def _parts(
     if counts.min() < 0 or counts.sum() != len(indices) or indices.min() < 0 or indices.max() >= len(points):
         raise BadInput("the faces of a mesh in the USD file do not fit its points; export it again")
     corners = _fans(counts)  # three positions in `indices` per triangle
-    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
-        corners = corners[:, ::-1]
     names = [primvar.GetPrimvarName() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars() if _is_uv(primvar)]
     uvs = _per_corner(prim, ("st", "UVMap", "st0", *names), indices, counts, time)
     colors = _per_corner(prim, ("displayColor",), indices, counts, time)
     matrix = np.array(cache.GetLocalToWorldTransform(prim))  # row vectors
+    mirrored = np.linalg.det(matrix[:3, :3]) < 0
+    if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
+        corners = corners[:, ::-1]
     placed = ((points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T).astype(np.float32)
     polygons = np.repeat(np.arange(len(counts)), (counts - 2).clip(0))  # of the triangles
     for owner, chosen in _faces_by_material(mesh, len(counts), time):

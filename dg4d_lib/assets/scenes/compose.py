@@ -353,7 +353,7 @@ def _retime(
         raise BadInput(f"{actor.name} would play {loops} times, at most {MAX_LOOPS} are allowed; lower its speed")
     times = np.concatenate([actor.item.start_s + (keys + period * loop) / speed for loop in range(loops)])
     values = np.concatenate([rows] * loops).astype(np.float64)
-    kept = np.append(np.diff(times) > SHORTEST_S, True)  # the end of a loop is the start of the next
+    kept = _apart(times)
     times, values = times[kept], values[kept]
     inside = times < length - SHORTEST_S
     after = int(inside.sum())
@@ -363,6 +363,22 @@ def _retime(
         last = last + min(share, 1.0) * (values[after] - last)
     times, values = np.append(times[inside], length), np.append(values[inside], last[None], axis=0)
     return times.astype("<f4"), values.astype("<f4")
+
+
+def _apart(times: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which keys to keep so that all are more than `SHORTEST_S` apart.
+
+    Of two keys at one time, as the end of a loop and the start of the next, the second is kept; of all, the first and
+    the last, which the asset shows before its start and after its end.
+    """
+    kept, following = np.zeros(len(times), bool), math.inf
+    for index in reversed(range(len(times))):
+        if following - times[index] > SHORTEST_S:
+            kept[index], following = True, times[index]
+    if kept.sum() > 1:
+        kept[kept.argmax()] = False
+        kept[0] = True
+    return kept
 
 
 def _cover_period(

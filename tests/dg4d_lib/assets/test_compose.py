@@ -1,6 +1,7 @@
 """Composed scenes: placement and timing as third-party readers see them."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -143,6 +144,19 @@ def test_every_track_ends_with_the_scene() -> None:
         keys = rows(file, sampler.input)[:, 0]
         assert keys[-1] == np.float32(1.7)
         assert (np.diff(keys) > 0).all()
+
+
+@pytest.mark.parametrize("speed", [200.0, 500.0])
+def test_an_asset_still_moves_at_a_speed_at_which_its_keys_are_too_close(speed: float) -> None:
+    fps = 80.0  # a key every 63 or 25 microseconds
+    body = AnimatedGlb(write_glb(replace(hopping(40), fps=fps), SETTINGS["plain"]))
+    one = actor("one", body, start_s=0.2, speed=speed, loop=False)
+    file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 1.0))
+    keys, values = track(file, named(file, "one subject"), "weights")
+    assert (np.diff(keys) > 0.99e-4).all() and len(keys) > 40 / fps / speed / 1.3e-4
+    assert keys[0] == np.float32(0.2) and not values[[0, -1]].any()  # frame 0 before and after
+    shown = values[1:-2].argmax(1) + 1
+    np.testing.assert_allclose(keys[1:-2], 0.2 + shown / fps / speed, atol=1e-7)
 
 
 def test_a_looping_motion_is_cut_where_it_is_when_the_scene_ends() -> None:

@@ -9,7 +9,8 @@ import pytest
 from foreign_models import BOX, CORNERS, RED_AND_BLUE, box_glb, png
 
 from dg4d_lib.assets.formats import draco
-from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.foreign_motion import write_moving_glb
 from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.errors import BadInput
 

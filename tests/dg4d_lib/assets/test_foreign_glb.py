@@ -6,12 +6,13 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from foreign_models import CORNERS, box_glb, skinned_glb
+from foreign_models import BOX, CORNERS, box_glb, skinned_glb
 
-from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb, write_moving_glb
+from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
 from dg4d_lib.assets.formats.foreign_joints import read_skeleton
+from dg4d_lib.assets.formats.foreign_motion import write_moving_glb
 from dg4d_lib.assets.formats.foreign_placement import place_moving_glb
-from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
+from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GlbReader, GltfDocument, read_accessor
 from dg4d_lib.assets.placement import Placement
 from dg4d_lib.errors import BadInput
 
@@ -122,6 +123,119 @@ def test_a_model_in_motion_is_placed_and_slowed_down(make):
         assert reader.tree["accessors"][sampler["input"]]["max"] == [times[-1]]
 
 
+def raised_glb() -> bytes:
+    """Return a box whose upper half a morph target lifts by 0.5 at its default weight, and whose normals it turns."""
+    document = GltfDocument({})
+    lift = np.where(CORNERS[:, 1:2] > 0, np.float32([0, 1, 0]), np.float32(0))
+    along_x, along_y = (np.tile(np.eye(3, dtype="<f4")[axis], (8, 1)) for axis in (0, 1))
+    attributes, target = (
+        {name: document.add_accessor(name, rows, VERTEX_DATA) for name, rows in given.items()}
+        for given in ({"POSITION": CORNERS, "NORMAL": along_x}, {"POSITION": lift, "NORMAL": 2 * along_y})
+    )
+    indices = document.add_accessor("triangles", BOX.ravel().astype("<u2"), INDEX_DATA)
+    primitive = {"attributes": attributes, "indices": indices, "targets": [target]}
+    mesh = document.add("meshes", name="box", primitives=[primitive], weights=[0.5])
+    node = document.add("nodes", name="box", mesh=mesh)
+    document.tree["scene"] = document.add("scenes", nodes=[node])
+    return document.to_bytes()
+
+
+def test_morph_targets_of_the_model_stay_at_their_default():
+    glb = read_foreign_glb(raised_glb(), MOST)
+    assert np.ptp(glb.model.vertices[:, 1]) == 1.5
+    moved = shifted(glb)
+    content, _ = write_moving_glb(glb, np.eye(4), moved, 10.0, {})
+    np.testing.assert_allclose(played(content, 2), moved[2], atol=1e-6)
+    reader = GlbReader(content)
+    (primitive,) = reader.tree["meshes"][0]["primitives"]
+    normals = read_accessor(reader, primitive["attributes"]["NORMAL"])
+    np.testing.assert_allclose(normals, np.tile([0.5**0.5, 0.5**0.5, 0], (8, 1)), atol=1e-6)
+    np.testing.assert_array_equal(read_accessor(reader, primitive["attributes"]["POSITION"]), glb.model.vertices)
+
+
+MIRROR = np.float32([-1, 1, 1])
+
+
+def mirrored(content: bytes, root: int) -> bytes:
+    return edited(content, lambda tree: tree["nodes"][root].update(scale=MIRROR.tolist()))
+
+
+@pytest.mark.parametrize(("make", "root"), [(box_glb, 1), (skinned_glb, 0)], ids=["box", "skin"])
+def test_mirrored_models_keep_their_outside(make, root):
+    plain, other = (read_foreign_glb(content, MOST).model for content in (make(), mirrored(make(), root)))
+    np.testing.assert_allclose(other.vertices, plain.vertices * MIRROR, atol=1e-6)
+    normals, mirrored_normals = (
+        np.cross(b - a, c - a) for a, b, c in (model.vertices[model.faces].swapaxes(0, 1) for model in (plain, other))
+    )
+    np.testing.assert_allclose(mirrored_normals, normals * MIRROR, atol=1e-6)
+
+
+def test_normals_of_mirrored_models_move_as_those_of_others():
+    turns = []
+    for content, mirror in ((raised_glb(), 1), (mirrored(raised_glb(), 0), MIRROR)):
+        glb = read_foreign_glb(content, MOST)
+        bent = (glb.model.vertices * mirror + np.float32([1, 0, 0]) * glb.model.vertices[:, 1:2] ** 2) * mirror
+        written, _ = write_moving_glb(glb, np.eye(4), np.stack([glb.model.vertices, bent]), 10.0, {})
+        reader = GlbReader(written)
+        (primitive,) = reader.tree["meshes"][0]["primitives"]
+        assert primitive["indices"] == 4
+        turns.append(read_accessor(reader, primitive["targets"][1]["NORMAL"]))
+    assert np.abs(turns[0]).max() > 0.1
+    np.testing.assert_allclose(turns[1], turns[0], atol=1e-5)
+
+
+def test_meshes_that_a_scale_of_0_hides_are_no_part_of_the_model_and_stay_in_the_file():
+    def edit(tree):
+        tree["meshes"].append(tree["meshes"][0])
+        tree["nodes"] += [{"mesh": 1}, {"scale": [0.0, 0.0, 0.0], "children": [2]}]
+        tree["scenes"][0]["nodes"].append(3)
+
+    glb = read_foreign_glb(edited(box_glb(), edit), max_faces=12)
+    assert len(glb.model.faces) == 12
+    tree = GlbReader(write_moving_glb(glb, np.eye(4), shifted(glb), 10.0, {})[0]).tree
+    assert tree["meshes"][tree["nodes"][2]["mesh"]] == GlbReader(box_glb()).tree["meshes"][0]
+    assert tree["nodes"][3]["scale"] == [0, 0, 0]
+    skinned = edited(skinned_glb(), lambda tree: tree["nodes"][2].update(scale=[0.0, 0.0, 0.0]))
+    assert len(read_foreign_glb(skinned, MOST).model.faces) == 16  # its own scale has no effect
+
+
+def hang_a_node_on_the_mesh(tree) -> None:
+    tree["nodes"][2]["children"] = [3]
+    tree["nodes"].append({})
+
+
+def make_the_mesh_a_joint(tree) -> None:
+    tree["skins"][0]["joints"].append(2)
+
+
+def add_triangles_without_weights(tree) -> None:
+    (primitive,) = tree["meshes"][0]["primitives"]
+    attributes = {"POSITION": primitive["attributes"]["POSITION"]}
+    tree["meshes"][0]["primitives"].append({**primitive, "attributes": attributes})
+
+
+@pytest.mark.parametrize(
+    ("edit", "apart"),
+    [
+        (lambda tree: None, True),
+        (hang_a_node_on_the_mesh, False),
+        (make_the_mesh_a_joint, False),
+        (add_triangles_without_weights, False),
+    ],
+    ids=["skinned alone", "with a child", "a joint", "partly skinned"],
+)
+def test_skinned_meshes_are_roots_unless_something_else_needs_their_place(edit, apart):
+    glb = read_foreign_glb(edited(skinned_glb(), edit), MOST)
+    placement = np.diag([0.5, 0.5, 0.5, 1.0])
+    placement[:3, 3] = (0.1, -0.2, 0.3)
+    moved = shifted(glb) * np.float32(0.5) + np.float32([0.1, -0.2, 0.3])
+    content, _ = write_moving_glb(glb, placement, moved, 10.0, {})
+    tree = GlbReader(content).tree
+    root, *others = tree["scenes"][0]["nodes"]
+    assert tree["nodes"][root]["name"] == "dg4d placement" and others == ([2] if apart else [])
+    np.testing.assert_allclose(played(content, 2), moved[2], atol=1e-5)
+
+
 def test_vertices_of_a_skin_follow_the_joints_at_rest():
     model = read_foreign_glb(skinned_glb(), MOST).model
     tip, foot = model.vertices[8], model.vertices[0]
@@ -227,11 +341,16 @@ def test_small_skins_are_read_and_flat_ones_refused():
         read_foreign_glb(edited(skinned_glb(), lambda tree: tree["nodes"][0].update(scale=[1, 0, 1])), MOST)
 
 
-def test_long_motions_have_fewer_keys():
+def test_long_motions_have_fewer_keys_and_last_as_long():
     glb = read_foreign_glb(box_glb(), MOST)
-    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb, 200), 10.0, {})
-    assert len(GlbReader(content).tree["meshes"][0]["primitives"][0]["targets"]) == 100
-    assert any("every 2. frame" in note for note in notes)
+    content, notes = write_moving_glb(glb, np.eye(4), shifted(glb, 129), 10.0, {})
+    reader = GlbReader(content)
+    (mesh,) = reader.tree["meshes"]
+    assert len(mesh["primitives"][0]["targets"]) == len(mesh["extras"]["targetNames"]) == 65
+    assert mesh["extras"]["targetNames"][1] == "frame_002"
+    times = read_accessor(reader, reader.tree["animations"][0]["samplers"][0]["input"]).ravel()
+    np.testing.assert_allclose(times, [*np.arange(0, 129, 2) / 10, 12.9], atol=1e-5)
+    assert any("a key every 2 frames" in note for note in notes)
 
 
 def test_materials_of_older_exporters_have_their_color():

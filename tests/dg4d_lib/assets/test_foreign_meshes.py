@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from foreign_models import BOX, CORNERS, RED_AND_BLUE, png
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, UsdVol
 
 from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
 from dg4d_lib.assets.formats.model_glb import write_model_glb
@@ -113,6 +113,26 @@ def test_colors_of_vertices_without_a_material_are_kept() -> None:
     text = TRIANGLE.replace("\n", " 1 0.5 0.25\n") + "f 1 2 3\n"
     (part,) = read_obj(text, FILES.get, decode_picture, 100).parts
     assert middle(part) == pytest.approx([1, 0.5, 0.25], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [((255, 128, 0), (1, 128 / 255, 0)), ((1.02, 0.5, 0), (1, 0.5, 0))],
+    ids=["bytes", "rounded"],
+)
+def test_colors_of_vertices_are_bytes_or_fractions(given: tuple[float, ...], expected: tuple[float, ...]) -> None:
+    text = TRIANGLE.replace("\n", " {} {} {}\n".format(*given)) + "f 1 2 3\n"
+    content = write_model_glb(read_obj(text, FILES.get, decode_picture, 100))
+    (part,) = read_foreign_glb(content, 100).model.parts
+    assert middle(part) == pytest.approx(expected, abs=1e-5) and 0 <= part.colors.min() <= part.colors.max() <= 1
+
+
+@pytest.mark.parametrize(("given", "expected"), [("255 0.5 0", (1, 0.5, 0)), ("-0.1 1.2 1", (0, 1, 1))])
+def test_colors_of_materials_are_clamped_in_the_glb(given: str, expected: tuple[float, ...]) -> None:
+    files = {"a.mtl": f"newmtl A\nKd {given}\n".encode()}
+    model = read_obj(f"mtllib a.mtl\n{TRIANGLE}usemtl A\nf 1 2 3\n", files.get, decode_picture, 100)
+    (part,) = read_foreign_glb(write_model_glb(model), 100).model.parts
+    assert middle(part) == pytest.approx(expected, abs=1e-5) and 0 <= min(part.factor) <= max(part.factor) <= 1
 
 
 def test_a_number_sign_in_a_name_begins_no_comment() -> None:
@@ -308,6 +328,28 @@ def test_usd_point_instancers_are_refused_where_they_are_rendered(visible: bool,
     else:
         instancer.MakeInvisible()
         assert [part.name for part in read_usd(packed(tmp_path, stage), decode_picture, 100).parts] == ["box"]
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+@pytest.mark.parametrize(("orientation", "volume"), [("rightHanded", 1.0), ("leftHanded", -1.0)])
+def test_usd_meshes_keep_their_outside_in_a_mirror(
+    orientation: str, volume: float, mirror: float, tmp_path: Path
+) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    mesh = box_of(stage, "/box")
+    mesh.CreateOrientationAttr(orientation)
+    mesh.AddScaleOp().Set(Gf.Vec3f(mirror, 1, 1))
+    model = read_usd(packed(tmp_path, stage), decode_picture, 100)
+    assert trimesh.Trimesh(model.vertices, model.faces, process=False).volume == pytest.approx(volume)
+
+
+def test_usd_splats_are_refused_with_the_formats_that_are_read(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    UsdVol.ParticleField3DGaussianSplat.Define(stage, "/splats")
+    with pytest.raises(
+        BadInput, match=r"splats and no mesh.*splats/000\.ply of a dg4d package, or its mesh, asset\.usdz"
+    ):
+        read_usd(packed(tmp_path, stage), decode_picture, 100)
 
 
 def test_usd_faces_of_two_corners_are_left_out(tmp_path: Path) -> None:

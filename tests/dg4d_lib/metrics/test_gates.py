@@ -9,6 +9,7 @@ from torch import Tensor
 from dg4d_lib.asset_settings import GateSettings
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
 from dg4d_lib.cameras.viewpoints import turntable
+from dg4d_lib.metrics import gates
 from dg4d_lib.metrics.gates import (
     MESH,
     SPLATS,
@@ -130,11 +131,11 @@ def test_the_worse_form_counts() -> None:
     ("value", "passed"), [(0.75, True), (0.7499, False), (1.25, True), (1.2501, False), (1.0, True)]
 )
 def test_bounds_belong_to_what_passes(value: float, passed: bool) -> None:
-    assert Gate("sharpness", {"mesh": value}, 0.75, 1.25, "", "", "").passed is passed
+    assert Gate("sharpness", {"mesh": value}, 0.75, 1.25, "", "").passed is passed
 
 
 def test_a_band_is_left_on_either_side() -> None:
-    gate = Gate("motion", {"splats": 0.1, "mesh": 1.1}, 0.6, 1.7, "", "", "")
+    gate = Gate("motion", {"splats": 0.1, "mesh": 1.1}, 0.6, 1.7, "", "")
     assert (gate.form, gate.value, gate.passed) == ("splats", 0.1, False)
     assert replace(gate, values={"splats": 0.7, "mesh": 5.0}).form == "mesh"
 
@@ -238,13 +239,55 @@ def test_every_threshold_decides() -> None:
         assert all(moved[other] == found[other] for other in found if other != name)
 
 
-def test_every_piece_of_advice_names_knobs_that_exist() -> None:
+def advice(**changes: object) -> dict[str, str]:
+    """Return the advice on gates that all fail, by gate."""
+    impossible = GateSettings(
+        fidelity_least=60, silhouette_least=1, consistency_least=1, flicker_most=0, floaters_most=0, flaws_most=0,
+        folds_most=0, added_folds_most=0, agreement_least=1, sharpness_least=10, motion_least=10,
+        sharpness_most=10, motion_most=100,
+    )  # fmt: skip
+    torn = SWAYING.alpha.clone()
+    torn[:, :6, :6] = 1
+    apart = replace(SWAYING, color=(SWAYING.color + 1) / 2, alpha=torn)
+    smaller = replace(SWAYING, alpha=SWAYING.alpha * 0)
+    failing = evidence(apart, SWAYING)
+    failing = replace(failing, side_views={SPLATS: apart, MESH: smaller}, flaws=1.0, folds=1.0, **changes)
+    return {gate.name: gate.advice for gate in evaluate_gates(failing, impossible)}
+
+
+@pytest.mark.parametrize("kind", [{}, {"per_frame": True}, {"own_model": True}], ids=["tracked", "per frame", "own"])
+def test_every_failed_gate_gives_advice_with_settings_that_exist(kind: dict[str, bool]) -> None:
     profiles = pytest.importorskip("steps.profiles")
     tree = profiles.PREVIEW.model_dump()
-    knobs = [
-        knob
-        for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())
-        for knob in re.findall(r"\b([a-z]+\.[a-z_]+)\b", gate.advice)
-    ]
-    assert len(knobs) > 9
+    found = advice(**kind)
+    assert all(found.values())
+    knobs = {knob for text in found.values() for knob in re.findall(r"\b([a-z]+\.[a-z_]+)\b", text)}
+    assert len(knobs) > 4
     assert [knob for knob in knobs if knob.split(".")[1] not in tree[knob.split(".")[0]]] == []
+
+
+def test_advice_fits_the_mesh() -> None:
+    assert "mesh.mode=per_frame" in advice()["folds"] and "mesh.mode=per_frame" in advice()["agreement"]
+    assert not [text for text in advice(per_frame=True).values() if "mesh.mode" in text or "mesh.source" in text]
+    own = " ".join(advice(own_model=True).values())
+    assert re.search(r"asset\.nodes", own) and not re.search(r"static\.|motion\.|mesh\.(?!texture_size)", own)
+
+
+@pytest.mark.parametrize(
+    ("splats", "mesh", "says"),
+    [
+        (0.35, 0.9, "raise static.iterations"),
+        (0.9, 0.35, "raise mesh.texture_size and mesh.render_size"),
+        (0.6, 0.35, "splats: raise static.iterations; mesh: raise mesh.texture_size and mesh.render_size"),
+        (1.4, 0.9, "lower static.color_lr"),
+        (1.4, 0.3, "raise mesh.texture_size and mesh.render_size"),
+        (0.9, 0.9, ""),
+    ],
+)
+def test_advice_is_for_the_form_and_the_side_that_fail(
+    splats: float, mesh: float, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = iter([splats, mesh])
+    monkeypatch.setattr(gates, "sharpness", lambda *_: next(values))
+    found = {gate.name: gate.advice for gate in evaluate_gates(evidence(SWAYING, SWAYING), GateSettings())}
+    assert found["sharpness"] == says

@@ -11,7 +11,7 @@ from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_bilinear, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
-from dg4d_lib.settings import TextureSettings
+from dg4d_lib.refiner_settings import TextureSettings
 from dg4d_lib.texture import refine
 from dg4d_lib.texture.refine import MeshClip, refine_textures
 from dg4d_lib.video.driving import DrivingVideo

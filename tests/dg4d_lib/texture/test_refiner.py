@@ -13,12 +13,13 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.clip_images import svd_clip_pixels
 from dg4d_lib.diffusion.latents import encode_images
 from dg4d_lib.diffusion.noise_schedule import ddim_timesteps
-from dg4d_lib.diffusion.video_model import VideoModel
+from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.zero123 import Zero123
-from dg4d_lib.settings import ImageToImageSettings, VideoModelSettings, VideoToVideoSettings, Zero123PriorSettings
-from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo
+from dg4d_lib.refiner_settings import ImageToImageSettings, VideoToVideoSettings
+from dg4d_lib.settings import VideoModelSettings, Zero123PriorSettings
+from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo, noise_levels
 
 CPU = torch.device("cpu")
 FRAMES, SIDE = 3, 32
@@ -108,7 +109,23 @@ def test_it_starts_at_the_level_of_the_paper_and_takes_eight_steps() -> None:
     model = VideoModel(parts.unet, parts.vae, parts.image_encoder, settings.model, CPU)
     refiner = VideoToVideo(settings, model, video()[0])
     assert isinstance(refiner, Refiner)
-    assert len(refiner.sigmas) == 9 and refiner.sigmas[0] == pytest.approx(1.2732, abs=1e-4)
+    sigmas = noise_levels(settings, 0.0)
+    assert sigmas == noise_levels(settings, 1.0)
+    assert len(sigmas) == 9 and sigmas[0] == pytest.approx(1.2732, abs=1e-4)
+
+
+@torch.no_grad()
+def test_noise_can_be_annealed_as_in_the_ablation_of_the_paper() -> None:
+    """T from 0.7 to 0.95 of the schedule is skipped, so that 8 to 2 of 25 steps are left."""
+    parts = tiny_svd()
+    settings = VideoToVideoSettings(strength_end=0.05, model=VideoModelSettings(decode_chunk_size=FRAMES))
+    model = VideoModel(parts.unet, parts.vae, parts.image_encoder, settings.model, CPU)
+    refiner, denoise, used = VideoToVideo(settings, model, video().float()[0]), model.denoise, []
+    model.denoise = lambda noisy, condition, sigmas: used.append(sigmas) or denoise(noisy, condition, sigmas)
+    for progress in (0.0, 0.5, 1.0):
+        refiner.refine(video().float(), CAMERAS, progress, rng(7))
+    levels = karras_sigmas(25)
+    assert used == [levels[start:] for start in (17, 20, 23)]
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

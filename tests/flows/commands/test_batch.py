@@ -25,6 +25,7 @@ from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
 from flows.commands.batch import batch, print_summary
 from flows.engine import resources
+from flows.engine.events import StepEvent, listening
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import items_of
 from flows.packages.summary import NOT_ACCEPTED, BatchProgress, Row, Writer
@@ -303,6 +304,32 @@ def test_a_made_batch_needs_no_server_and_says_that_there_is_nothing_to_do(
     monkeypatch.setattr("flows.convert.connect", lambda: pytest.fail("nothing is to be made"))
     rows = batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET)
     assert [row.status for row in rows] == ["unchanged"]
+
+
+def test_a_step_of_an_item_is_recorded_when_it_ends(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flows.convert.connect", lambda: None)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.png").write_text(picture(f"recorded {tmp_path}"))
+    before, recorded = set(home.records().rglob("*")), []
+
+    def note(event: StepEvent) -> None:
+        if (event.step, event.kind) == ("fit_motion", "started"):
+            recorded.append(len(set(home.records().rglob("*")) - before))
+
+    with listening(note):
+        batch(CatalogRequest(inputs=str(tmp_path / "in"), out=tmp_path / "out"), QUIET)
+    assert recorded == [3]  # prepare_subject, drive_video, fit_gaussians
+
+
+def test_a_manifest_is_read_once(place: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_text(picture("x"))
+    (tmp_path / "list.csv").write_text("path\na.png\n")
+    read: list[Any] = []
+    monkeypatch.setattr("flows.catalog_request.items_of", lambda *given: read.append(given) or items_of(*given))
+    monkeypatch.setattr("flows.catalog.convert_all", lambda todo, *_: read.extend(job.item for job in todo))
+    request = CatalogRequest(inputs=str(tmp_path / "list.csv"), out=tmp_path / "out")
+    inside_a_flow(lambda: batch(request, QUIET))
+    assert read[1:] == ["a"]
 
 
 def test_a_hundred_items_are_found_unchanged_in_a_moment_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

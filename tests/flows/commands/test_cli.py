@@ -51,6 +51,15 @@ def test_a_folder_instead_of_a_file() -> None:
     refused(dg4d("make", "pets", "-o", "out"), "dg4d batch pets")
 
 
+@pytest.mark.parametrize("name", ["DG4D_HOME", "DG4D_STORE", "DG4D_WEIGHTS"])
+def test_processes_that_a_command_starts_get_absolute_folders(
+    place: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv(name, "here")
+    assert dg4d("settings", "static").exit_code == 0
+    assert os.environ[name] == str(place / "here")
+
+
 def test_an_empty_picture() -> None:
     Path("none.png").touch()
     refused(dg4d("make", "none.png", "-o", "out"), "empty (0 bytes)")
@@ -359,7 +368,7 @@ def test_a_data_set_with_nothing_in_it() -> None:
     ("code", "status", "says"),
     [
         (errno.EACCES, 65, "Permission denied: a; choose another path"), (errno.ENAMETOOLONG, 65, "choose another"),
-        (errno.ENOSPC, 65, "free some space"), (errno.EROFS, 65, "free some space"),
+        (errno.ENOSPC, 65, "free some space"), (errno.EROFS, 65, "Read-only file system: a; choose another"),
         (errno.EPIPE, 1, "internal error"),
     ],
 )  # fmt: skip

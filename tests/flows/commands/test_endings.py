@@ -1,5 +1,6 @@
 """Endings of a command: exit statuses of errors; lost signals come again, and cleanup is left in peace."""
 
+import errno
 import os
 import signal
 import time
@@ -11,7 +12,7 @@ import typer
 from dg4d_lib.errors import DG4DError
 from flows.commands import endings
 from flows.engine.item_runs import ItemFailed
-from flows.exit_status import EXIT_FAILED, EXIT_HANGUP, EXIT_STATUS, EXIT_TERMINATED
+from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_HANGUP, EXIT_STATUS, EXIT_TERMINATED
 from flows.serving.server import ServerUnavailable
 from flows.step_errors import StepError
 from flows.studio.drafts import TooLarge
@@ -58,6 +59,24 @@ def test_an_item_of_several_has_the_exit_status_that_its_error_has_alone() -> No
     for kind in {*of_ours(DG4DError), *of_ours(StepError), ServerUnavailable} - {ItemFailed}:
         error = kind("fit", "why") if issubclass(kind, StepError) else kind.__new__(kind, "why")
         assert endings._describe(error)[1] == EXIT_STATUS.get(kind.__name__, EXIT_FAILED), kind
+
+
+@pytest.mark.parametrize(
+    ("path", "advice"),
+    [
+        ("/here/home/locks", "name a writable folder in $DG4D_HOME"),
+        ("/here", "name a writable folder in $DG4D_HOME"),  # the home folder has to be created
+        ("/here/home/store/x", "name a writable folder in $DG4D_STORE"),
+        ("/out/x", "choose another path"),
+    ],
+)
+def test_a_read_only_folder_is_told_with_the_variable_that_names_it(
+    monkeypatch: pytest.MonkeyPatch, path: str, advice: str
+) -> None:
+    monkeypatch.setenv("DG4D_HOME", "/here/home")
+    monkeypatch.setenv("DG4D_STORE", "/here/home/store")
+    error = OSError(errno.EROFS, "Read-only file system", path)
+    assert endings._describe(error) == (f"Read-only file system: {path}; {advice}", EXIT_BAD_INPUT)
 
 
 def of_ours(kind: type[Exception]) -> set[type[Exception]]:

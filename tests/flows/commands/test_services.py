@@ -16,7 +16,7 @@ from dg4d_lib.errors import BadInput
 from flows import convert
 from flows.commands import services
 from flows.serving import background, watching, workers
-from flows.serving.server import Server
+from flows.serving.server import Server, ServerUnavailable
 from flows.serving.workers import running
 from flows.ui import showing
 
@@ -152,6 +152,12 @@ def test_a_command_uses_the_server_that_it_connected_to(tmp_path: Path, monkeypa
     monkeypatch.setattr("flows.engine.orphans.settle_orphans", lambda: 0)
     convert.connect()
     assert background.background_server().is_used()
+    (tmp_path / "server" / "port").write_text("1")
+    convert.connect()  # as for the next picture: starts the server again if it has ended
+    with monkeypatch.context() as moved:
+        moved.setattr(Server, "wait_for_address", lambda _: "http://127.0.0.1:2")
+        with pytest.raises(ServerUnavailable, match="another program took the port"):
+            convert.connect()
     used[tmp_path / "server"].release()
     assert not background.background_server().is_used()
 

@@ -14,9 +14,10 @@ import fake_steps
 import pytest
 from conversions import EVERY_STEP, RUN_FACTS, job, ran, store_is_sound, tree
 from fake_steps import picture
+from obstore.store import LocalStore
 from postgresql import server_on_postgresql
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.settings import PREFECT_API_URL, PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED, temporary_settings
 from rich.console import Console
 from waiting import retry_after, start, wait_until
 
@@ -32,7 +33,7 @@ from flows.engine.step_tasks import RETRIES
 from flows.packages.publish import load_verified
 from flows.serving.server import Server, answers
 from flows.step_errors import StepBadInput, StepOutOfMemory, StepTimedOut
-from steps.store.artifact_store import ArtifactStore
+from steps.store.bucket import BucketStore
 
 STAGES = [EVERY_STEP[:1], EVERY_STEP[1:3], *([step] for step in EVERY_STEP[3:])]  # of parallel steps
 DAY_S = 86400.0
@@ -142,6 +143,19 @@ def test_a_server_killed_during_a_run_is_started_again_and_the_run_goes_on(
     with get_client(sync_client=True) as client:
         (newest,) = client.read_flow_runs(limit=1, sort="START_TIME_DESC")  # type: ignore[arg-type]
     assert newest.name == "fake" and newest.state is not None and newest.state.is_completed()
+    load_verified(tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_a_flow_begins_again_with_a_new_server_if_the_old_one_was_killed_with_its_guard(
+    server: Server, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DG4D_STORE")  # the new server outlives this test and its store
+    os.kill(json.loads((server.folder / "server.json").read_text())["guard"], signal.SIGKILL)
+    wait_until(lambda: server.address() is None)
+    with temporary_settings({PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED: False}):  # as in commands
+        convert_job(job("guard", tmp_path), tmp_path / "out")
+    assert sorted(ran(log)) == sorted(EVERY_STEP)
     load_verified(tmp_path / "out")
 
 
@@ -281,7 +295,7 @@ def test_a_clock_that_jumps_during_a_run_makes_nothing_needed_go(
 
 
 def test_a_lock_from_the_future_on_another_machine_does_not_hold_for_ever(tmp_path: Path) -> None:
-    store = ArtifactStore(tmp_path)
+    store = BucketStore(LocalStore(tmp_path), tmp_path / "copies", "local")
     theirs = leases.Collecting(host="another", pid=1, start="1", token="t")
     store.write(leases.LOCK, theirs.model_dump_json())
     lock = tmp_path / leases.LOCK

@@ -21,6 +21,14 @@ def test_a_process_on_this_machine_is_in_the_same_place() -> None:
     assert _said()[1] == host_id()
 
 
+def test_a_process_keeps_its_place_when_the_name_of_the_host_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = host_id()
+    monkeypatch.setattr("socket.gethostname", lambda: "in-another-network")
+    assert host_id() == before
+    monkeypatch.setenv("DG4D_HOST_ID", "given")
+    assert host_id() == "given"
+
+
 def test_a_container_with_the_name_of_its_host_is_another_place() -> None:
     name, elsewhere = _said("unshare", "--pid", "--fork")
     assert name == _said()[0]

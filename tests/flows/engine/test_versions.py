@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,16 @@ def test_a_lease_ends_with_its_process_however_that_ends(tmp_path: Path) -> None
     assert [entry.name for entry in collect(store, tmp_path / "results").artifacts] == [used.digest]
 
 
+def test_things_are_removed_from_a_full_disk(tmp_path: Path, no_room: AbstractContextManager[None]) -> None:
+    store = ArtifactStore(tmp_path / "store")
+    useless = store.put_bytes(b"useless", "a/b")
+    os.utime(store.path(useless), (0, 0))
+    with no_room:
+        gone = collect(store, tmp_path / "results").artifacts
+    assert [entry.name for entry in gone] == [useless.digest]
+    assert not store.has(useless)
+
+
 def test_one_removes_things_at_a_time_and_one_that_was_killed_is_in_nobodys_way(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path / "store")
     process = other_process(store, "collect")
@@ -172,18 +183,19 @@ def test_one_removes_things_at_a_time_and_one_that_was_killed_is_in_nobodys_way(
     killed(process)
     assert not leases.wait_for_collecting(store)
     collect(store, tmp_path / "results")
-    assert list(store.entries("collecting")) == []
 
 
 def test_a_lock_of_another_machine_is_believed_as_long_as_it_gives_signs_of_life(
-    store: ArtifactStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    store = BucketStore(MemoryStore(), tmp_path / "copies", "memory")
     lock = {"host": "elsewhere", "pid": 1, "start": "1", "token": "t"}
     store.write(leases.LOCK, json.dumps(lock))
     with pytest.raises(BadInput, match="another `dg4d store gc`"):
         collect(store, tmp_path / "results")
     monkeypatch.setattr(leases, "LOCK_S", -1.0)
     collect(store, tmp_path / "results")
+    assert list(store.entries("collecting")) == []
 
 
 def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_there(

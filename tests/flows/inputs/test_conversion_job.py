@@ -6,7 +6,8 @@ from PIL import Image
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.rasterizer import backends
-from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
+from flows.inputs.conversion_job import MESH_STEPS, SHAPE_STEPS, ConversionJob, ConversionRequest, name_from_text
+from flows.stages import planned_steps
 from steps.profiles import PREVIEW, revise
 from steps.store.artifact_store import ArtifactStore
 
@@ -22,9 +23,10 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def request(
-    path: Path | None, video: Path | None = None, bank: Path | None = None, **changes: object
+    path: Path | None, video: Path | None = None, bank: Path | None = None, asset: Path | None = None, **changes: object
 ) -> ConversionRequest:
-    return ConversionRequest(item="x", picture=path, video=video, bank=bank, settings=revise(PREVIEW, dict(changes)))
+    settings = revise(PREVIEW, dict(changes))
+    return ConversionRequest(item="x", picture=path, video=video, bank=bank, asset=asset, settings=settings)
 
 
 def job(request: ConversionRequest, store: ArtifactStore) -> ConversionJob:
@@ -129,6 +131,31 @@ def test_what_cannot_work_is_refused_before_any_work(tmp_path: Path) -> None:
     request(good, bank=bank, **{"prior.kind": "oracle"}).check()
     with pytest.raises(BadInput, match=r"prior\.kind=oracle"):
         request(good, bank=bank).check()
+
+
+def test_settings_of_a_fitted_shape_have_no_effect_on_a_model(tmp_path: Path) -> None:
+    (tmp_path / "a.glb").write_bytes(b"glTF")
+    (tmp_path / "a.spz").write_bytes(b"NGSP")
+    (tmp_path / "scan.ply").write_bytes(b"ply\nelement vertex 3\nelement face 0\nend_header\n")
+    (tmp_path / "mesh.ply").write_bytes(b"ply\nelement vertex 3\nelement face 1\nend_header\n")
+    changes = {
+        "static.iterations": 9, "static.views": 2, "mesh.max_faces": 999, "mesh.texture_size": 512,
+        "asset.nodes": 50, "pack.fps": 12, "subject.size": 128, "driving.motion": "wave",
+    }  # fmt: skip
+    for name in ("a.glb", "mesh.ply"):
+        (mesh,) = request(None, asset=tmp_path / name, **changes).unused()
+        assert mesh == f"settings without an effect: static.*, mesh.max_faces; {name} keeps its own shape"
+    for name in ("a.spz", "scan.ply"):
+        (splats,) = request(None, asset=tmp_path / name, **changes).unused()
+        assert splats == f"settings without an effect: static.*; {name} keeps its own shape"
+    assert request(None, asset=tmp_path / "a.glb").unused() == []
+
+
+def test_no_step_of_an_own_model_is_left_out(tmp_path: Path, store: ArtifactStore) -> None:
+    model = tmp_path / "a.glb"
+    model.write_bytes(b"glTF")
+    planned = planned_steps(job(request(None, asset=model), store))
+    assert not set(planned) & (SHAPE_STEPS | MESH_STEPS)
 
 
 def test_what_has_no_effect_is_named(tmp_path: Path) -> None:

@@ -339,8 +339,19 @@ def test_a_worker_is_told_the_folders_of_the_option_else_of_the_variable_else_th
     monkeypatch.delenv(SOURCES)
     assert told() == [str(place), f"{place}/away"]
     refused(lambda: told("nowhere"), "--sources nowhere is not a folder")
-    (place / "a:b").mkdir()
-    refused(lambda: told("a:b"), "separates folders")
+
+
+def test_a_folder_with_the_separator_in_its_path_grants_no_other(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    odd = place / "in:away"
+    (odd / "below").mkdir(parents=True)
+    (place / "link").symlink_to(odd)
+    for given in ("in:away", "link"):
+        refused(lambda given=given: roots.environment([given]), "separates folders")  # type: ignore[misc]
+    monkeypatch.chdir(odd)
+    refused(lambda: roots.environment(["below"]), "separates folders")
+    monkeypatch.delenv(SOURCES)
+    refused(roots.environment, "in:away contains ':', which separates folders")
+    assert Roots.of_this_process().sources == (str(odd),)
 
 
 # Watched folders

@@ -1,5 +1,6 @@
 import fcntl
 import http.server
+import socket
 import subprocess
 import threading
 import time
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from dg4d_lib.errors import BadInput
 from flows.serving import server as module
 from flows.serving.server import Server, ServerUnavailable, answers
 
@@ -62,6 +64,24 @@ def test_a_port_is_kept_while_it_is_free(tmp_path: Path) -> None:
     assert bound() == port
     with http.server.HTTPServer(("127.0.0.1", port), http.server.BaseHTTPRequestHandler):
         assert bound() != port
+
+
+def test_no_other_program_can_listen_on_the_port_of_a_server_that_starts(tmp_path: Path) -> None:
+    with module._listener(tmp_path / "server.json") as listener, socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with pytest.raises(OSError, match="in use"):
+            other.bind(listener.getsockname())
+        assert not answers(f"http://127.0.0.1:{listener.getsockname()[1]}", timeout_s=0.1)  # open, but no server yet
+
+
+@pytest.mark.parametrize("idle", ["30min", "nan", "-1"])
+def test_an_idle_time_that_is_no_number_of_seconds_is_refused_where_the_server_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: str
+) -> None:
+    monkeypatch.setattr(module, "spawn_guard", lambda *_: pytest.fail("the guard is started"))
+    monkeypatch.setenv(module.IDLE, idle)
+    with pytest.raises(BadInput, match=rf"\$DG4D_SERVER_IDLE_S is '{idle}'; set it to a number of seconds"):
+        Server(tmp_path, tmp_path).start()
 
 
 def test_what_does_not_answer_or_is_something_else_is_not_our_server() -> None:

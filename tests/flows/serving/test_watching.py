@@ -1,8 +1,10 @@
+import os
 from pathlib import Path
 
 import pytest
 
 from dg4d_lib.errors import BadInput
+from flows.serving.results import RECORD, Results
 from flows.serving.watching import Watcher
 
 
@@ -59,6 +61,25 @@ def test_packages_hidden_files_and_links_do_not_count(folder: Path) -> None:
     (folder / ".part").write_text("arriving")
     (folder / "link.png").symlink_to(folder / "a.png")
     assert watcher(folder, rest_s=0).look(0) == digest
+
+
+def test_a_folder_that_vanishes_during_a_look_is_left_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", ".b.incoming-1", "c"):
+        (folder / name).mkdir()
+        (folder / name / RECORD).write_text("{}")
+    real = os.scandir
+
+    def scandir(path: os.PathLike[str]) -> "os._ScandirIterator[str]":
+        if Path(path).name not in {"in", "a"}:
+            raise FileNotFoundError(path)
+        return real(path)
+
+    results, looking = Results(folder.parent / "nothing"), watcher(folder, rest_s=0)
+    results.out = folder
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert results.look() == [f"done: {folder}/a"]
+    assert looking.look(0) is not None
+    assert list(looking._stamps) == [f"a/{RECORD}"]
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:

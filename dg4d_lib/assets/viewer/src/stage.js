@@ -34,6 +34,7 @@ export class Stage {
     this.light();
     this.reset();
     this.resize();
+    this.followPixelRatio();
   }
 
   /** Resets the camera to the input view. */
@@ -94,6 +95,12 @@ export class Stage {
     this.camera.fov = (360 / Math.PI) * Math.atan(half);
     this.camera.updateProjectionMatrix();
     this.stale = true;
+  }
+
+  /** Resizes when the pixel ratio changes, as on another screen; a query matches one ratio, so each needs its own. */
+  followPixelRatio() {
+    const moved = () => (this.resize(), this.followPixelRatio());
+    matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", moved, { once: true });
   }
 
   /** For the clay under the wireframe; textures are shown as they are. */
