@@ -66,5 +66,5 @@ def hints_of(depth: Float[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> dict[s
         "noisy distances": depth_field(noisy, known, alpha, "distance"),
         "place": exact,
     }
-    found = {"nothing": DepthHint(), "turn": DepthHint(turn_deg)} | {k: DepthHint(0.0, f) for k, f in fields.items()}
+    found = {"nothing": DepthHint(), "turn": DepthHint(turn_deg)} | {k: DepthHint(None, f) for k, f in fields.items()}
     return {name: found[name] for name in NAMES}

@@ -45,7 +45,7 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
     kind = settings.static.start
     assert not isinstance(kind, LgmStartSettings), "these fits start without LGM"
     start = initial_gaussians(
-        kind, subject_shapes(settings.prior, [subject], DepthHint(settings.subject.turn_deg)), generator
+        kind, subject_shapes(settings.prior, [subject], DepthHint(settings.subject.turn_deg or None)), generator
     )
     prior = prior_of(specimen.bank, settings, settings.static)
     return fit_gaussians(start, subject, prior, RASTERIZE, settings.static, generator)

@@ -116,7 +116,7 @@ def known_bank(subject: Subject, views: Path, settings: PipelineSettings) -> Ban
 def score_first(subject: Subject, settings: PipelineSettings, sides: Bank | None) -> tuple[Figures, Tensor]:
     """Compare the shape of frame 0, without any fit, with the true views."""
     shapes = subject_shapes(
-        settings.prior, [prepared(subject, settings)[0]], DepthHint(settings.subject.turn_deg), sides
+        settings.prior, [prepared(subject, settings)[0]], DepthHint(settings.subject.turn_deg or None), sides
     )
     rows, strips = [], []
     for azimuth, truth in subject.views.items():

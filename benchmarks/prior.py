@@ -105,7 +105,7 @@ def score_prior(
 
 def surface_strip(cutout: Tensor, settings: PipelineSettings) -> Tensor:
     """Return the picture and the surface of frame 0 from eight sides, over white."""
-    shapes = subject_shapes(settings.prior, [cutout], DepthHint(settings.subject.turn_deg))
+    shapes = subject_shapes(settings.prior, [cutout], DepthHint(settings.subject.turn_deg or None))
     cameras = [OrbitCamera(SHEET_ELEVATION_DEG, azimuth, width=SHEET, height=SHEET) for azimuth in range(0, 360, 45)]
     color, alpha = render_surface(shapes.surface(0), cameras)
     return torch.cat([over_white(resize(cutout[None], (SHEET, SHEET)))[0], *(color * alpha + 1 - alpha)], 1)

@@ -90,7 +90,7 @@ def fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None)
     """
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
     cutouts = prepared(subject, settings)
-    hint = DepthHint(settings.subject.turn_deg) if sides else hint_of(cutouts, settings)
+    hint = DepthHint(settings.subject.turn_deg or None) if sides else hint_of(cutouts, settings)
     start_settings = settings.static.start
     assert not isinstance(start_settings, LgmStartSettings), "these fits start without LGM"
     shapes = subject_shapes(settings.prior, [cutouts[0]], hint, sides)

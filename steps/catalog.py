@@ -6,7 +6,7 @@ Artifacts:
   bank        zip of bank.json (steps/sources/banks.py) and a sheet per view
   matte       PNG with one channel: alpha in the pixels of a picture
   facts       JSON {"width": ..., "height": ..., "kind": ..., "frames": ..., "notes": [...], "problem": ...} of a source
-  pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, 0 where it shows none
+  pose        JSON {"turn_deg": ...}: turn of the subject's plane that its footage shows, null where it shows none
   depth-field safetensors of steps/artifacts/depth_fields.py: depth of the middle of the subject behind every pixel
   model       uncompressed zip of model.SUFFIX (.glb, .gltf, .obj, .usdz, .ply, .spz) and the files that it refers to
   glb         GLB of the model; `moving` has a morph target per frame

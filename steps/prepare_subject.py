@@ -57,8 +57,8 @@ def run(job: Job) -> StepReport:
         footage = DrivingVideo(cutouts[..., :3].contiguous(), cutouts[..., 3:].contiguous(), source.fps)
         write_frames(job.outputs["footage"], footage)
         turn_deg = ground_turn(footage.alpha, settings.ground_turn)
-        write_pose(job.outputs["pose"], Pose(turn_deg=round(turn_deg, 3)))
-        notes = (*notes, turn_note(turn_deg)) if turn_deg and not settings.turn_deg else notes
+        write_pose(job.outputs["pose"], Pose(turn_deg=None if turn_deg is None else round(turn_deg, 3)))
+        notes = (*notes, turn_note(turn_deg)) if turn_deg is not None and not settings.turn_deg else notes
     tiles = picture_of(source.frames[0], cutouts[0])
     if hinted:
         field, note = hinted
@@ -81,12 +81,14 @@ def read_hint(job: Job, source: Source, prepared: PreparedSubject) -> tuple[Dept
 
 
 def turn_note(turn_deg: float) -> str:
-    """Return the sentence about a turn that was found."""
-    nearer = "right" if turn_deg > 0 else "left"
+    """Return the sentence about a turn that was found, in degrees; below half a degree the line counts as level."""
+    found, turn = "it is level", "not to be turned"
+    if degrees := round(abs(turn_deg)):
+        found = f"its {'right' if turn_deg > 0 else 'left'} end is nearer"
+        turn = f"to be turned by about {degrees} degrees"
     return (
-        f"ground line of the footage: its {nearer} end is nearer, so priors without weights take the subject to be "
-        f"turned by about {abs(turn_deg):.0f} degrees if no other views are given; `subject.turn_deg` overrides it, "
-        "`subject.ground_turn=0` ignores it"
+        f"ground line of the footage: {found}, so priors without weights take the subject {turn} if no other views are "
+        "given; `subject.turn_deg` overrides it, `subject.ground_turn=0` ignores it"
     )
 
 

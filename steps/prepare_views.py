@@ -12,8 +12,8 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
 from dg4d_lib.input_settings import SubjectSettings
-from dg4d_lib.video.subject import Segmenter, prepare_subject
-from dg4d_lib.visual_hull.adjusting import adjust_exposure, match_scale, scaling_between
+from dg4d_lib.video.subject import PreparedSubject, Segmenter, prepare_subject
+from dg4d_lib.visual_hull.adjusting import brightened, exposure_gains, match_scale, scaling_between
 from dg4d_lib.visual_hull.agreement import Agreement, agreement, hull_alpha, smaller, turntable_score
 from dg4d_lib.visual_hull.known import KnownView, angle_deg, known_view
 from steps.artifacts.archives import unpack
@@ -29,7 +29,7 @@ from steps.sources.views import CLOSE_DEG, GivenView, GivenViews, read_views
 
 TURNTABLE_FRAMES = 24  # of a turntable are used
 FEWEST_FRAMES = 8  # of a turntable
-LARGEST_WHOLE = 2048  # pixels of a side of an uncropped picture
+LARGEST_CROP = 2048  # pixels of a side of the picture of a known camera, cropped to the subject
 STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
 OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
 LEAST_FILLED = 0.78  # share of a silhouette that the hull of all fills: below, a view is not of this subject
@@ -37,7 +37,7 @@ RELIABLE = 0.9  # mean share from which colors of the hull's surface are compare
 FEW = 4  # views; among more, thin parts seen edge-on fill little of single silhouettes
 LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
 GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
-INPUT = "the input"
+INPUT, TURNTABLE = "the input", "the turntable"  # names for messages
 Moments = list[list[KnownView]]  # views by frame
 
 
@@ -67,10 +67,10 @@ def run(job: Job) -> StepReport:
         write_png(job.pictures / "views.png", picture)
         raise
     write_png(job.outputs["picture"], picture)
-    adjusted = adjust_exposure(first) if found.mean > RELIABLE else first
-    notes = (*notes, *exposure_notes(first, adjusted))
-    if len(moments) == 1:
-        moments = [adjusted[1:]]
+    if found.mean > RELIABLE:
+        gains = exposure_gains(first)[1:]
+        notes = (*notes, *exposure_notes(moments[0], gains))
+        moments = [[brightened(*pair) for pair in zip(views, gains, strict=True)] for views in moments]
     write_bank(job.outputs["known_views"], moments, job.pictures)
     job.progress(3, 3, {})
     used = network if known.used_network else LoadedNetwork()
@@ -117,19 +117,19 @@ class _Reader:
         if given.input_camera is not None:
             placed = self._placed(given, sources, self._source(), self.inputs[:1])
             return [[frames[0] for frames in placed]], ()
-        cutouts, notes = zip(*(self._cut(source) for source in sources), strict=True)
-        return [self._scaled(given.views, [cutout[0] for cutout in cutouts])], tuple(
-            dict.fromkeys(note for several in notes for note in several)
+        prepared = [self._cut(source, view.name) for source, view in zip(sources, given.views, strict=True)]
+        return [self._scaled(given.views, [each.frames[0] for each in prepared])], tuple(
+            dict.fromkeys(note for each in prepared for note in each.notes)
         )
 
     def turntable(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
         """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
-        source = self._read(given.turntable, "the turntable", TURNTABLE_FRAMES)
+        source = self._read(given.turntable, TURNTABLE, TURNTABLE_FRAMES)
         check_turn(source)
         places = evenly_spaced(source.count, TURNTABLE_FRAMES)
-        cutouts, notes = self._cut(source)
-        angles = [360 * place / source.count for place in places]
-        views = self._turned(cutouts, angles)
+        prepared = self._cut(source, TURNTABLE)
+        notes, angles = prepared.notes, [360 * place / source.count for place in places]
+        views = self._turned(prepared.frames, angles)
         if given.views:
             (more,), other_notes = self.views(given)
             alone = [v for v in views if all(angle_deg(v.camera, own.camera) > CLOSE_DEG for own in more)]
@@ -155,8 +155,8 @@ class _Reader:
         first, mask = replace(own, frames=own.frames[:1]), None
         if "mask" in self.files:
             mask = read_mask(self.files["mask"], own, self.folder, self._most, self.settings.max_decode_gb)[:1]
-        whole = self._cut_whole(first, inputs.shape[1], scaled_box(self.box, own), mask)
-        return place_pictures(given, sources, own, whole, inputs, self._cut_whole)
+        settings = self.settings.model_copy(update={"box": scaled_box(self.box, own)})
+        return place_pictures(given, sources, own, self._cut(first, INPUT, settings, mask), inputs, self._cut_close)
 
     @property
     def _most(self) -> int:
@@ -174,20 +174,25 @@ class _Reader:
             raise BadInput(f"{name}: {error}") from error
 
     def _cut(
-        self, source: Source, settings: SubjectSettings | None = None, mask: Float[Tensor, "t h w"] | None = None
-    ) -> tuple[Float[Tensor, "t s s 4"], tuple[str, ...]]:
-        """Cut out the subject, by default framed as the input; return notes, too."""
+        self,
+        source: Source,
+        name: str,
+        settings: SubjectSettings | None = None,
+        mask: Float[Tensor, "t h w"] | None = None,
+    ) -> PreparedSubject:
+        """Cut out the subject of a file with a name for messages, by default framed as the input."""
         settings = settings or self.settings
-        prepared = prepare_subject(source.frames, source.has_alpha, settings, mask, self.segmenter)
+        try:
+            prepared = prepare_subject(source.frames, source.has_alpha, settings, mask, self.segmenter)
+        except BadInput as error:
+            raise BadInput(f"{name}: {error}") from error
         self.used_network |= prepared.estimate is not None and prepared.estimate.used_network
-        return prepared.frames, prepared.notes
+        return prepared
 
-    def _cut_whole(
-        self, source: Source, size: int, box: tuple[int, ...] = (), mask: Float[Tensor, "t h w"] | None = None
-    ) -> Float[Tensor, "t s s 4"]:
-        """Cut out the subject in the whole frame, without a crop."""
-        whole = SubjectSettings(size=min(LARGEST_WHOLE, size), framing="keep", matting=self.settings.matting, box=box)
-        return self._cut(source, whole, mask)[0]
+    def _cut_close(self, source: Source, name: str, size: int) -> PreparedSubject:
+        """Cut out the subject, cropped to it in squares of at most so many pixels a side."""
+        size = min(LARGEST_CROP, size)
+        return self._cut(source, name, SubjectSettings(size=size, framing="center", matting=self.settings.matting))
 
     def _scaled(self, given: Sequence[GivenView], cutouts: Sequence[Float[Tensor, "s s 4"]]) -> list[KnownView]:
         """Return views in the scale of the input: as they are, or with its height, whichever agrees better."""
@@ -265,9 +270,9 @@ def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
     )
 
 
-def exposure_notes(before: Sequence[KnownView], after: Sequence[KnownView]) -> tuple[str, ...]:
-    """Return a note for every view that was made brighter or darker."""
-    changed = [old for old, new in zip(before, after, strict=True) if new is not old]
+def exposure_notes(views: Sequence[KnownView], gains: Sequence[Float[Tensor, " 3"] | None]) -> tuple[str, ...]:
+    """Return a note that names the views that get brighter or darker."""
+    changed = [view for view, gain in zip(views, gains, strict=True) if gain is not None]
     return (f"exposure adjusted to the input: {', '.join(_place(view) for view in changed)}",) if changed else ()
 
 
@@ -286,8 +291,8 @@ def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:
 
 
 def _place(view: KnownView) -> str:
-    camera = view.camera
-    return f"{view.name or 'a view'} (azimuth {camera.azimuth_deg:g}, elevation {camera.elevation_deg:g})"
+    azimuth, elevation = (round(angle, 1) + 0.0 for angle in (view.camera.azimuth_deg, view.camera.elevation_deg))
+    return f"{view.name or 'a view'} (azimuth {azimuth:g}, elevation {elevation:g})"  # + 0.0: no -0
 
 
 def _input_frames(job: Job, scratch: Path) -> Float[Tensor, "t s s 4"]:

@@ -16,7 +16,7 @@ NEAREST_HORIZON = 0.02  # of the picture's height: depth is unbounded there
 LARGEST_DEG = 25.0
 
 
-def ground_turn(alpha: Float[Tensor, "t h w 1"], trust: float) -> float:
+def ground_turn(alpha: Float[Tensor, "t h w 1"], trust: float) -> float | None:
     """Return the turn of the subject's plane about the vertical, degrees; see `inflate`.
 
     The feet of all frames stand on one plane. Seen from elevation 0, the depth of a point on it is inversely
@@ -28,17 +28,18 @@ def ground_turn(alpha: Float[Tensor, "t h w 1"], trust: float) -> float:
         trust: factor on the angle, in [0, 1]; the result is clipped to 25 degrees.
 
     Returns:
-        0 where the line says nothing: few frames, a short line, a solid base, or feet at the horizon.
+        0 for a level line; None where there is no trust or the line says nothing: few frames, a short line, a solid
+        base, or feet at the horizon.
     """
     shown = (alpha[..., 0] > SUBJECT).any(0).cpu().numpy()
-    if len(alpha) < FEWEST_FRAMES or not shown.any():
-        return 0.0
+    if not trust or len(alpha) < FEWEST_FRAMES or not shown.any():
+        return None
     height, width = shown.shape
     columns = np.flatnonzero(shown.any(0))
     lowest = height - shown[::-1].argmax(0)[columns]
     corners = _lower_hull(np.stack([columns + 0.5, lowest.astype(np.float64)], -1))
     if len(corners) < 2:
-        return 0.0
+        return None
     centroid = np.nonzero(shown)[1].mean() + 0.5
     right = int(np.searchsorted(corners[:, 0], centroid).clip(1, len(corners) - 1))
     (x0, y0), (x1, y1) = ends = corners[right - 1 : right + 1]
@@ -47,7 +48,7 @@ def ground_turn(alpha: Float[Tensor, "t h w 1"], trust: float) -> float:
     gap = (line - lowest[below]).mean() / (x1 - x0) if below.any() else 0.0
     narrow = x1 - x0 < NARROWEST * len(columns)
     if narrow or gap < SMALLEST_GAP or min(y0, y1) < (0.5 + NEAREST_HORIZON) * height:
-        return 0.0
+        return None
     angles = (2 * ends - (width, height)) / height * math.tan(math.radians(FOV_Y_DEG) / 2)
     depth = 1 / angles[:, 1]  # in units of the camera's height above the ground
     across = angles[:, 0] * depth

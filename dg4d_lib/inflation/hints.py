@@ -55,17 +55,17 @@ class DepthHint:
 
     Attributes:
         turn_deg: how far its plane is turned about the vertical; positive brings the right side of the picture nearer
-            to the camera. Between -60 and 60.
+            to the camera. Between -60 and 60; None: not known.
         field: depth of the first frame, which goes before the plane.
     """
 
-    turn_deg: float = 0.0
+    turn_deg: float | None = None
     field: DepthField | None = None
 
     @property
     def says_nothing(self) -> bool:
         """True if nothing is known."""
-        return not self.turn_deg and self.field is None
+        return self.turn_deg is None and self.field is None
 
     @property
     def sigma(self) -> float:
@@ -78,7 +78,7 @@ class DepthHint:
         Pixels for which nothing is known, as those that only a later frame covers, take the depth of the nearest known
         one; its weight falls with the distance, from 1 to 0, and the plane takes over.
         """
-        plane = turned_plane(size, self.turn_deg)
+        plane = turned_plane(size, self.turn_deg or 0.0)
         if self.field is None:
             return plane, np.zeros_like(plane)
         value, known = _resized(self.field, size)

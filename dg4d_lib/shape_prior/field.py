@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.images import resize_planes
+from dg4d_lib.images import luminance, resize_planes
 from dg4d_lib.inflation.heights import heights
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.mask import subject_mask
@@ -25,6 +25,8 @@ INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an in
 SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
 SMOOTHNESS, KNOWN_SMOOTHNESS = 2.0, 1.0  # cells: of surfaces that the network guesses, and of those that are known
 LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
+HIDDEN_BRIGHTNESS = 0.9  # of hidden matter, relative to the picture: what the network says of it is too dark
+LARGEST_GAIN, DARKEST = 2.0, 0.02  # of hidden colors, either way; luminance below which nothing is brighter
 
 
 @dataclass(frozen=True)
@@ -70,13 +72,13 @@ class Fields(Protocol):
 class ShapeFields:
     """Fields of the frames of a subject, each predicted when first asked for.
 
-    All frames share one code of the subject, the mean of their own.
+    All frames share one code of the subject, the mean of their own. A single picture is encoded when first asked for.
     """
 
     def __init__(
         self, network: ShapePriorNetwork, cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint = NO_HINT
     ) -> None:
-        """Encode the pictures.
+        """Encode the pictures if there are several.
 
         Args:
             network: in evaluation mode.
@@ -92,9 +94,10 @@ class ShapeFields:
             )
         self._network, self._hint = network, hint
         self._pictures = [premultiplied(cutout) for cutout in cutouts]
-        with torch.no_grad():
-            pairs = [network.encode(torch.stack([picture, picture.flip(2)])).code for picture in self._pictures]
-        self._code = torch.stack(pairs).mean(0) if pairs else torch.empty(0)
+        self._kept: Features | None = None  # of a single picture; those of a long video would fill the memory
+        self._code: Float[Tensor, "2 c"] | None = None  # None: the picture's own
+        if len(self) > 1:
+            self._code = torch.stack([self._features(frame).code for frame in range(len(self))]).mean(0)
 
     def __len__(self) -> int:
         return len(self._pictures)
@@ -108,23 +111,24 @@ class ShapeFields:
         picture = self._pictures[frame]
         mask = picture_mask(picture)
         features = self._features(frame)
-        with torch.no_grad():
-            both = self._rays(features)
-        logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
+        logits, colors, share = self._matter(features, mask)
         knots = colors.permute(3, 2, 0, 1)[None]
         hidden = interpolate(knots, (BINS, SIZE, SIZE), mode="trilinear", align_corners=True)[0].permute(2, 3, 1, 0)
-        logits = bounded_logits(logits + hint_evidence(self._hint, logits, mask), mask)
-        share = inflated_share(logits.sigmoid(), mask)
-        if share > 0:
-            inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
-            logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
-        front, plane = straight_color(picture), self._mirror_plane(features)
+        front, plane, probability = straight_color(picture), self._mirror_plane(features), logits.sigmoid()
+        hidden = as_bright_as(hidden, probability, picture)
         if plane.trust > 0:
-            probability = logits.sigmoid()
             left = transmittance(optical_density(probability, mask))
             hidden = mirrored_colors(hidden, front, probability, left, mask, plane)
         smoothness = KNOWN_SMOOTHNESS if self._hint.sigma else SMOOTHNESS
         return ShapeField(logits, front, hidden, mask, share, smoothness)
+
+    def logits(self, frame: int) -> Float[Tensor, "128 128 64"]:
+        """Return the log-odds of matter of a frame, as in its field; much faster than `predict`.
+
+        Raises:
+            BadInput: the picture shows no subject.
+        """
+        return self._matter(self._features(frame), picture_mask(self._pictures[frame]))[0]
 
     def mirror_plane(self, frame: int) -> MirrorPlane:
         """Return the mirror plane of a frame."""
@@ -132,9 +136,28 @@ class ShapeFields:
 
     def _features(self, frame: int) -> Features:
         """Return the features of the picture and its mirror image."""
+        if self._kept is not None:
+            return self._kept
         picture = self._pictures[frame]
         with torch.no_grad():
-            return self._network.encode(torch.stack([picture, picture.flip(2)]))
+            features = self._network.encode(torch.stack([picture, picture.flip(2)]))
+        if len(self) == 1:
+            self._kept = features
+        return features
+
+    def _matter(
+        self, features: Features, mask: Bool[Tensor, "128 128"]
+    ) -> tuple[Float[Tensor, "128 128 64"], Float[Tensor, "128 128 8 3"], float]:
+        """Return log-odds, colors at the knots of every ray, and the share of the inflation in the probabilities."""
+        with torch.no_grad():
+            both = self._rays(features)
+        logits, colors = ((part[0] + part[1].flip(1)) / 2 for part in both)
+        logits = bounded_logits(logits + hint_evidence(self._hint, logits, mask), mask)
+        share = inflated_share(logits.sigmoid(), mask)
+        if share > 0:
+            inflated = inflated_probability(mask).clamp(torch.tensor(-LARGEST_LOGIT).sigmoid())
+            logits = torch.logit((1 - share) * logits.sigmoid() + share * inflated, 1e-3)
+        return logits, colors, share
 
     def _mirror_plane(self, features: Features) -> MirrorPlane:
         """Return the mirror plane of a frame, the mean over the picture and its mirror image."""
@@ -192,6 +215,22 @@ def picture_mask(picture: Float[Tensor, "4 128 128"]) -> Bool[Tensor, "128 128"]
         BadInput: the picture shows no subject.
     """
     return torch.from_numpy(subject_mask(picture[3].double().numpy())[0])
+
+
+def as_bright_as(
+    hidden: Float[Tensor, "128 128 64 3"], probability: Float[Tensor, "128 128 64"], picture: Float[Tensor, "4 128 128"]
+) -> Float[Tensor, "128 128 64 3"]:
+    """Return hidden colors times one factor, with which they have 0.9 of the picture's brightness in the mean.
+
+    Args:
+        hidden: colors in [0, 1].
+        probability: of matter, the weights of the mean.
+        picture: premultiplied color and alpha.
+    """
+    seen = luminance(picture[:3].movedim(0, -1)).sum() / picture[3].sum()
+    guessed = (luminance(hidden) * probability).sum() / probability.sum()
+    gain = HIDDEN_BRIGHTNESS * seen / guessed.clamp(min=DARKEST)
+    return (hidden * gain.clamp(1 / LARGEST_GAIN, LARGEST_GAIN)).clamp(max=1)
 
 
 def straight_color(picture: Float[Tensor, "4 128 128"]) -> Float[Tensor, "128 128 3"]:

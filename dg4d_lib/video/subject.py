@@ -29,6 +29,7 @@ from dg4d_lib.video.soft_edges import free_colors
 
 OVERSAMPLING = 2  # maximum size of opaque frames before matting, relative to the size of the square
 SMALLEST_SUBJECT = 16  # longest side, pixels; a smaller subject has too few pixels to reconstruct
+NAMED_AT_MOST = 8  # frames that a message lists
 BOX_MARGIN = 0.1  # margin around the user's box that matting sees, as a share of its longest side
 UNCERTAIN = "so the outline is an estimate; if it is wrong, give a PNG with transparency, --mask FILE or --box X,Y,W,H."
 NOTES = {
@@ -90,7 +91,7 @@ def prepare_subject(
         segmenter: network for opaque frames.
 
     Raises:
-        BadInput: nothing is visible in the first frame, no subject is found, it is too small, or the box is outside.
+        BadInput: nothing is visible in a frame, no subject is found, it is too small, or the box is outside.
         BackendUnavailable: the network is not installed.
     """
     check_box(settings.box, frames.shape[2], frames.shape[1])
@@ -107,8 +108,7 @@ def prepare_subject(
         frames = _inside(frames, settings.box)
     alpha = frames[..., 3]
     bounding_box(alpha)  # raises if no frame shows anything
-    if not (alpha[0] > VISIBLE).any():
-        raise BadInput("the first frame shows no subject; trim the video so that it starts with the subject in view")
+    check_shown(alpha)
     left, top, right, bottom = bounding_box(alpha[:1])
     if max(right - left, bottom - top) < SMALLEST_SUBJECT:
         raise BadInput(
@@ -121,6 +121,22 @@ def prepare_subject(
         notes = (*notes, "The subject fills the whole picture, so there is no outline to build a shape from.")
     height, width = alpha.shape[1:]
     return PreparedSubject(reframe(frames, crop, settings.size), (height, width), crop, notes, estimate)
+
+
+def check_shown(alpha: Float[Tensor, "t h w"]) -> None:
+    """Refuse frames without a visible pixel.
+
+    Raises:
+        BadInput: names the frames, the first of which is 1.
+    """
+    empty = [str(number) for number, frame in enumerate(alpha, 1) if not (frame > VISIBLE).any()]
+    if not empty:
+        return
+    named = empty if len(empty) <= NAMED_AT_MOST else [*empty[:NAMED_AT_MOST], f"{len(empty) - NAMED_AT_MOST} more"]
+    listed = f"frames {', '.join(named[:-1])} and {named[-1]}" if len(named) > 1 else f"frame {named[0]}"
+    raise BadInput(
+        f"{listed} of {len(alpha)} show{'s' * (len(named) == 1)} no subject; trim the video, or correct --mask or --box"
+    )
 
 
 def check_box(box: tuple[int, ...], width: int, height: int) -> None:

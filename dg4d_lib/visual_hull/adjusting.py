@@ -81,10 +81,19 @@ def warped(cutout: Float[Tensor, "h w 4"], matrix: Float[Tensor, "1 2 3"], size:
 
 
 def adjust_exposure(views: Sequence[KnownView]) -> list[KnownView]:
-    """Return views whose colors are multiplied so that they agree where they show the same, the first unchanged.
+    """Return views whose colors agree where they show the same; see `exposure_gains`."""
+    return [brightened(view, gain) for view, gain in zip(views, exposure_gains(views), strict=True)]
 
-    One gain per view and channel: least squares of the differences of logarithms over pairs of views, each the median
-    over the vertices of the hull that both show, with a weak pull to 1.
+
+def exposure_gains(views: Sequence[KnownView]) -> list[Float[Tensor, " 3"] | None]:
+    """Return a factor per channel and view by which colors agree where views show the same; None: no change.
+
+    Least squares of the differences of logarithms over pairs of views, each the median over the vertices of the hull
+    that both show, with a weak pull to 1. The first view is not changed, nor those whose gain may as well come from
+    the coarse hull.
+
+    Args:
+        views: of one moment, the input view first.
     """
     volume = hull(views, CELLS)
     vertices, faces = extract(volume)
@@ -106,13 +115,14 @@ def adjust_exposure(views: Sequence[KnownView]) -> list[KnownView]:
         rows.append(torch.eye(count)[i] * STIFFNESS)
         values.append(torch.zeros(3))
     matrix = torch.stack(rows)[:, 1:]  # the first gain is 1
-    gains = torch.linalg.lstsq(matrix, torch.stack(values)).solution
-    return [views[0], *(_brighter(view, gain) for view, gain in zip(views[1:], gains, strict=True))]
+    found = torch.linalg.lstsq(matrix, torch.stack(values)).solution
+    gains = [gain.exp().clamp(1 / LARGEST_GAIN, LARGEST_GAIN) for gain in found]
+    sure = [float(gain.mean().abs()) >= UNSURE for gain in found]
+    return [None, *(gain if is_sure else None for gain, is_sure in zip(gains, sure, strict=True))]
 
 
-def _brighter(view: KnownView, log_gain: Float[Tensor, " 3"]) -> KnownView:
-    """Return the view itself if its gain may as well come from the coarse hull."""
-    if float(log_gain.mean().abs()) < UNSURE:
+def brightened(view: KnownView, gain: Float[Tensor, " 3"] | None) -> KnownView:
+    """Return a view with multiplied colors; the view itself without a gain."""
+    if gain is None:
         return view
-    gain = log_gain.exp().clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
     return replace(view, cutout=torch.cat([(view.cutout[..., :3] * gain).clamp(0, 1), view.cutout[..., 3:]], -1))

@@ -11,7 +11,9 @@ from steps.contract import Frozen
 class Pose(Frozen):
     """Pose of the subject in front of the input camera."""
 
-    turn_deg: float = Field(ge=-60, le=60, description="turn of its plane about the vertical; see `subject.turn_deg`")
+    turn_deg: float | None = Field(
+        ge=-60, le=60, description="turn of its plane about the vertical; see `subject.turn_deg`; null: not known"
+    )
 
 
 def write_pose(path: Path, pose: Pose) -> None:
@@ -19,14 +21,14 @@ def write_pose(path: Path, pose: Pose) -> None:
     path.write_text(pose.model_dump_json(), encoding="utf-8")
 
 
-def read_turn(path: Path | None) -> float:
-    """Return the turn of the subject that its footage shows, degrees; 0 without a file.
+def read_turn(path: Path | None) -> float | None:
+    """Return the turn of the subject that its footage shows, degrees; None if it shows none or without a file.
 
     Raises:
         BadInput: the file is no pose.
     """
     if path is None:
-        return 0.0
+        return None
     try:
         return Pose.model_validate_json(path.read_bytes()).turn_deg
     except ValidationError as error:

@@ -230,7 +230,7 @@ def subject_shapes(
 
 def _predicted_logits(cutout: Float[Tensor, "h w 4"]) -> Float[Tensor, "128 128 64"]:
     """Return the log-odds of matter that the shape network predicts behind one picture."""
-    return ShapeFields(packaged.packaged_network(), [cutout]).predict(0).logits
+    return ShapeFields(packaged.packaged_network(), [cutout]).logits(0)
 
 
 def _carried_shapes(
@@ -306,18 +306,19 @@ def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None,
         settings: of the prior.
         pose: turn that the footage shows; views of other sides make it needless.
         field: depth by the user.
-        turn_deg: turn by the user, which goes before that of the footage.
+        turn_deg: turn by the user, which goes before that of the footage; 0: not known.
     """
-    turn_deg = turn_deg or usable_turn(settings, read_turn(pose))
-    return DepthHint(turn_deg, read_depth_field(field) if field else None)
+    return DepthHint(turn_deg or usable_turn(settings, read_turn(pose)), read_depth_field(field) if field else None)
 
 
-def usable_turn(settings: PriorSettings, shown_deg: float) -> float:
-    """Return the turn that a prior takes where footage shows one, degrees.
+def usable_turn(settings: PriorSettings, shown_deg: float | None) -> float | None:
+    """Return the turn that a prior takes where footage shows one, degrees; None where it shows none.
 
     The inflation takes it as it is. For the shape network it is evidence beside what the network sees itself.
     """
-    return shown_deg * NETWORK_TRUST if isinstance(settings, LearnedPriorSettings) else shown_deg
+    if shown_deg is None or not isinstance(settings, LearnedPriorSettings):
+        return shown_deg
+    return shown_deg * NETWORK_TRUST
 
 
 def inflated_note(share: float) -> str:

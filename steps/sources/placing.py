@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.framing import bounding_box
+from dg4d_lib.video.subject import PreparedSubject
 from dg4d_lib.visual_hull.adjusting import warped
 from dg4d_lib.visual_hull.known import KnownView, known_view
 from dg4d_lib.visual_hull.rig import OrbitPlace, meeting_point, orbit_places
@@ -22,9 +23,9 @@ def place_pictures(
     given: GivenViews,
     sources: Sequence[Source],
     source: Source,
-    whole: Float[Tensor, "1 s2 s2 4"],
+    first: PreparedSubject,
     inputs: Float[Tensor, "t s s 4"],
-    cut_out: Callable[[Source, int], Float[Tensor, "n s s 4"]],
+    cut_out: Callable[[Source, str, int], PreparedSubject],
 ) -> list[list[KnownView]]:
     """Return the views of every camera by frame.
 
@@ -34,9 +35,10 @@ def place_pictures(
         given: views with their cameras, and the camera of the input.
         sources: decoded files of the views.
         source: decoded file of the input.
-        whole: its first frame, cut out as `inputs` and without a crop.
+        first: its first frame, cut out by the settings of `inputs`.
         inputs: frames of the input, cut out and framed.
-        cut_out: cuts the subject out of the file of a view, without a crop, in squares of at most so many pixels.
+        cut_out: cuts the subject out of the file of a view with this name, cropped to it in squares of at most so many
+            pixels a side.
 
     Raises:
         BadInput: the cameras look away from the subject, from above, or two of them are one.
@@ -45,17 +47,16 @@ def place_pictures(
     cameras = [given.input_camera, *(view.camera for view in given.views if view.camera is not None)]
     poses = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
     size = inputs.shape[1]
-    scale, offset = _framing(_box(inputs[:1], 2 / size, 1), _tangent_box(whole, given.input_camera, source))
+    scale, offset = _framing(_box(inputs[:1], 2 / size, 1), _tangent_box(first, given.input_camera, source))
     origin = _origin(poses, meeting_point(poses), scale, offset)
     places = orbit_places(poses, 0, origin)
     _check(places[1:], given)
     views = []
     for view, place, camera, file in zip(given.views, places[1:], cameras[1:], sources, strict=True):
-        theta = _affine(place, camera, file, scale)
-        cut = cut_out(file, 2 * size)
-        views.append(
-            [known_view(warped(frame, theta, size), place.azimuth_deg, place.elevation_deg, view.name) for frame in cut]
-        )
+        cut = cut_out(file, view.name, 2 * size)
+        theta = _affine(place, camera, file, cut, scale)
+        pictures = [warped(frame, theta, size) for frame in cut.frames]
+        views.append([known_view(each, place.azimuth_deg, place.elevation_deg, view.name) for each in pictures])
     return views
 
 
@@ -64,12 +65,19 @@ def _box(cutouts: Float[Tensor, "t s s 4"], unit: float, half: float) -> Box:
     return left, top, right, bottom
 
 
-def _tangent_box(whole: Float[Tensor, "t s s 4"], camera: PlacedCamera, source: Source) -> Box:
+def _tangent_box(cut: PreparedSubject, camera: PlacedCamera, source: Source) -> Box:
     """Return the outline's box in tangents of the angles from the optical axis."""
-    half = _half(camera, source)
-    x, y = _principal(camera, source)
-    left, top, right, bottom = _box(whole, 2 / whole.shape[1], 1)
+    half, (x, y), (zoom, across, down) = _half(camera, source), _principal(camera, source), _crop_place(cut)
+    left, top, right, bottom = _box(cut.frames, 2 * zoom / cut.frames.shape[1], zoom)
+    x, y = x - across, y - down
     return (left - x) * half, (top - y) * half, (right - x) * half, (bottom - y) * half
+
+
+def _crop_place(cut: PreparedSubject) -> tuple[float, float, float]:
+    """Return half the side, column and row of the middle of a crop in the square around its picture, in [-1, 1]."""
+    (height, width), crop = cut.frame, cut.crop
+    side = max(height, width)
+    return crop.side / side, (2 * crop.left + crop.side - width) / side, (2 * crop.top + crop.side - height) / side
 
 
 def _half(camera: PlacedCamera, source: Source) -> float:
@@ -105,14 +113,16 @@ def _origin(
     return pose[:, 3] + depth * (x * pose[:, 0] - y * pose[:, 1] - pose[:, 2])
 
 
-def _affine(place: OrbitPlace, camera: PlacedCamera, source: Source, scale: float) -> Float[Tensor, "1 2 3"]:
-    """Return the map from places in the framed view to places in the square around the picture."""
-    half, (x, y) = _half(camera, source), _principal(camera, source)
+def _affine(
+    place: OrbitPlace, camera: PlacedCamera, source: Source, cut: PreparedSubject, scale: float
+) -> Float[Tensor, "1 2 3"]:
+    """Return the map from places in the framed view to places in the crop of the picture."""
+    half, (x, y), (side, across, down) = _half(camera, source), _principal(camera, source), _crop_place(cut)
     c, s = math.cos(math.radians(place.roll_deg)), math.sin(math.radians(place.roll_deg))
-    zoom = 1 / (scale * place.distance * half)
+    zoom = 1 / (scale * place.distance * half * side)
     rows = [
-        [c * zoom, -s * zoom, place.center[0] / half + x],
-        [s * zoom, c * zoom, place.center[1] / half + y],
+        [c * zoom, -s * zoom, (place.center[0] / half + x - across) / side],
+        [s * zoom, c * zoom, (place.center[1] / half + y - down) / side],
     ]
     return torch.tensor([rows])
 

@@ -68,30 +68,37 @@ def test_a_video_becomes_footage_whose_first_frame_is_the_subject(tmp_path):
     assert any("5 of the video's 9 frames" in note for note in facts.notes)
 
 
-def slanted_legs(frames: int = 8) -> np.ndarray:
-    """A table on two thin legs, the right one longer: nearer to the camera."""
+def table(right_leg: int, frames: int = 8) -> np.ndarray:
+    """A table on two thin legs; a longer one is nearer to the camera."""
     film = np.zeros((frames, 64, 64, 4), np.uint8)
     film[:, 16:36, 10:54] = 255
-    film[:, 36:50, 12:15] = film[:, 36:56, 49:52] = 255
+    film[:, 36:50, 12:15] = film[:, 36 : 36 + right_leg, 49:52] = 255
     return film
 
 
-def test_footage_on_a_slanted_ground_line_is_turned(tmp_path):
-    source = save_clip(tmp_path / "a.mkv", slanted_legs(), "ffv1", "bgra")
-    turns = []
-    for name, factor in (("half", 0.5), ("none", 0.0)):
-        facts = prepare(source, tmp_path / name, framing="keep", ground_turn=factor)
-        turns.append(read_turn(tmp_path / name / "pose.json"))
-        assert any("its right end is nearer" in note for note in facts.notes) == (factor > 0)
-    assert 3 < turns[0] <= 25 and turns[1] == 0
+@pytest.mark.parametrize(
+    ("right_leg", "ground_turn", "least", "most", "noted"),
+    [
+        (20, 0.5, 3, 25, "its right end is nearer"),
+        (14, 0.5, 0, 0, "it is level"),
+        (20, 0.0, None, None, ""),
+        (14, 0.0, None, None, ""),
+    ],
+)
+def test_footage_is_turned_as_its_ground_line(right_leg, ground_turn, least, most, noted, tmp_path):
+    source = save_clip(tmp_path / "a.mkv", table(right_leg), "ffv1", "bgra")
+    facts = prepare(source, tmp_path / "out", framing="keep", ground_turn=ground_turn)
+    found = read_turn(tmp_path / "out" / "pose.json")
+    assert found is None if least is None else least <= found <= most
+    assert [noted in note for note in facts.notes if "ground line" in note] == [True] * bool(noted)
 
 
 def test_a_broken_pose_is_refused(tmp_path):
-    for text in ("{", '{"turn_deg": 80}', '{"turn_deg": null}', "[]"):
+    for text in ("{", '{"turn_deg": 80}', "{}", "[]"):
         (tmp_path / "pose.json").write_text(text)
         with pytest.raises(BadInput, match="no pose"):
             read_turn(tmp_path / "pose.json")
-    assert read_turn(None) == 0
+    assert read_turn(None) is None
 
 
 def test_the_same_file_gives_the_same_bytes(tmp_path):

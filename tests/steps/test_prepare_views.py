@@ -110,9 +110,11 @@ def test_a_view_of_something_else_is_refused_by_name_with_the_picture(tmp_path):
     assert (tmp_path / "seen" / "views.png").is_file()
 
 
-def clip(folder: Path, azimuths: list[float]) -> bytes:
+def clip(folder: Path, azimuths: list[float], exposure: float = 1.0) -> bytes:
     """Return a zip of frames from these azimuths."""
-    frames = [(f"{i:03d}.png", png(seen(creature(), a), folder)) for i, a in enumerate(azimuths)]
+    views = [seen(creature(), azimuth) for azimuth in azimuths]
+    dimmed = [replace(v, cutout=v.cutout * torch.tensor([exposure] * 3 + [1])) for v in views]
+    frames = [(f"{i:03d}.png", png(view, folder)) for i, view in enumerate(dimmed)]
     write_zip(folder / "frames.zip", frames)
     return (folder / "frames.zip").read_bytes()
 
@@ -170,6 +172,46 @@ def test_pictures_of_known_cameras_are_placed_by_them(excluded_by, tmp_path):
         assert (view.camera.azimuth_deg, view.camera.elevation_deg) == pytest.approx((azimuth, elevation), abs=1e-3)
         truth = seen(creature(), azimuth, elevation).cutout
         assert float(iou(view.cutout[None, ..., 3:], truth[None, ..., 3:])) > 0.95
+
+
+def far(view: KnownView, margin: int) -> KnownView:
+    """Return the view in the middle of a larger picture."""
+    return replace(view, cutout=torch.nn.functional.pad(view.cutout, (0, 0, *[margin] * 4)))
+
+
+def test_pictures_of_known_cameras_may_show_the_subject_small(tmp_path):
+    found = []
+    for margin in (100, 500):
+        folder = tmp_path / str(margin)
+        folder.mkdir()
+        place = Workplace(folder, far(seen(creature(), 0), margin))
+        files = {"000": png(far(seen(creature(), 75, 20), margin), folder)}
+        focal = SIZE / (SIZE + 2 * margin)
+        cameras = [placed(*each).model_copy(update={"focal": placed(0).focal * focal}) for each in ((0,), (75, 20))]
+        place.prepare(
+            GivenViews(views=(GivenView(file="000", name="side", camera=cameras[1]),), input_camera=cameras[0]), files
+        )
+        found.append(place.known()[0].cutout)
+    small, smaller = ((cutout[None, ..., 3:]) for cutout in found)
+    assert float(iou(small, smaller)) > 0.99
+    assert (found[0] - found[1]).abs().mean() < 0.01
+
+
+def test_synchronized_videos_get_the_exposure_of_the_input_in_all_frames(tmp_path):
+    place = Workplace(tmp_path, clip(tmp_path, [0.0] * 2))
+    views = tuple(GivenView(file=f, name=f, camera=placed(a)) for f, a in (("00", 75), ("01", 200)))
+    files = {"00": clip(tmp_path, [75.0] * 2, 0.5), "01": clip(tmp_path, [200.0] * 2, 0.5)}
+    report = place.prepare(GivenViews(views=views, input_camera=placed(0)), files)
+    assert report.notes == (
+        "exposure adjusted to the input: 00 (azimuth 75, elevation 0), 01 (azimuth -160, elevation 0)",
+    )
+    bank = read_bank(tmp_path / "known.zip", tmp_path / "bank")
+    for frame in (0, 1):
+        for view, azimuth in zip(known_views(bank, frame), (75, 200), strict=True):
+            mean, expected = (
+                each[each[..., 3] > 0.9][:, :3].mean() for each in (view.cutout, seen(creature(), azimuth).cutout)
+            )
+            assert float(mean) == pytest.approx(float(expected), rel=0.05)  # half of it before
 
 
 def test_synchronized_videos_have_as_many_frames_as_the_input_before_any_are_left_out(tmp_path):

@@ -40,9 +40,17 @@ def test_a_large_turn_is_clipped():
     assert ground_turn(walker(45), 1.0) == LARGEST_DEG
 
 
+def test_a_level_line_is_a_turn_of_zero():
+    assert ground_turn(walker(0), 1.0) == 0
+
+
+def test_a_line_without_trust_says_nothing():
+    assert ground_turn(walker(0), 0.0) is None
+
+
 def test_a_solid_base_says_nothing():
     slope = (ROWS - 150 < 0.2 * (COLUMNS - 80)) & (ROWS > 60) & ((COLUMNS - SIZE / 2).abs() < 60)
-    assert ground_turn(slope[None, ..., None].float().expand(8, -1, -1, -1), 1.0) == 0
+    assert ground_turn(slope[None, ..., None].float().expand(8, -1, -1, -1), 1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -57,4 +65,4 @@ def test_a_solid_base_says_nothing():
     ids=["few frames", "feet close together", "feet at the horizon", "nothing", "one column"],
 )
 def test_unclear_footage_says_nothing(footage):
-    assert ground_turn(footage, 1.0) == 0
+    assert ground_turn(footage, 1.0) is None

@@ -38,6 +38,10 @@ def test_no_hint_and_a_hint_at_what_the_network_says_change_nothing() -> None:
     assert hint_evidence(same, logits, MASK)[MASK].abs().max() < 1e-6
 
 
+def test_a_level_plane_is_evidence() -> None:
+    assert hint_evidence(DepthHint(0.0), bump(0.3), MASK)[MASK].abs().max() > 1
+
+
 def test_evidence_of_the_middle_is_a_ratio_of_gaussians() -> None:
     found = middle_evidence(np.full((1, 1), 0.2), np.full((1, 1), -0.1))[0, 0]
     expected = ((DEPTHS + 0.1) ** 2 - (DEPTHS - 0.2) ** 2) / (2 * PLANE_SIGMA**2)

@@ -20,6 +20,7 @@ from dg4d_lib.shape_prior.field import (
     UNSURE,
     ShapeField,
     ShapeFields,
+    as_bright_as,
     inflated_probability,
     inflated_share,
 )
@@ -153,6 +154,17 @@ def test_frames_share_the_code_of_their_subject():
     assert (both.predict(0).logits - alone.predict(0).logits).abs().max() > 1e-4
 
 
+def test_a_single_picture_is_encoded_once_and_only_if_it_is_asked_for(monkeypatch):
+    network, encoded = tiny_network(), []
+    encode = network.encode
+    monkeypatch.setattr(network, "encode", lambda picture: encoded.append(picture) or encode(picture))
+    fields = ShapeFields(network, [cutout()])
+    assert not encoded
+    assert torch.equal(fields.logits(0), fields.predict(0).logits)
+    fields.mirror_plane(0)
+    assert len(encoded) == 1
+
+
 def test_matter_is_inside_the_silhouette_alone():
     field = ShapeFields(tiny_network(), [cutout()]).predict(0)
     assert (field.logits[~field.mask] == -LARGEST_LOGIT).all()
@@ -199,3 +211,17 @@ def test_a_ray_whose_cells_are_all_equal_has_matter_in_its_middle():
 def test_oblong_pictures_are_refused():
     with pytest.raises(BadInput, match="square"):
         ShapeFields(tiny_network(), [cutout()[:64]])
+
+
+@pytest.mark.parametrize(
+    ("seen", "guessed", "expected"),
+    [(0.5, 0.3, 0.45), (0.2, 0.3, 0.18), (0.9, 0.1, 0.2), (0.1, 0.9, 0.45), (0.9, 0.7, 0.81), (0.0, 0.0, 0.0)],
+)
+def test_hidden_colors_are_nearly_as_bright_as_the_picture(seen: float, guessed: float, expected: float) -> None:
+    """Of twice or half the brightness at most; where there is no matter, colors do not count."""
+    picture = torch.zeros(4, SIZE, SIZE)
+    picture[:, 40:80] = torch.tensor([seen, seen, seen, 1.0])[:, None, None]
+    probability, hidden = torch.zeros(SIZE, SIZE, BINS), torch.rand(SIZE, SIZE, BINS, 3)
+    probability[40:80, :, 20:30], hidden[40:80, :, 20:30] = 0.7, guessed
+    found = as_bright_as(hidden, probability, picture)[40:80, :, 20:30]
+    torch.testing.assert_close(found, torch.full_like(found, expected))

@@ -68,9 +68,18 @@ def test_a_fully_transparent_picture_is_refused():
         prepare_subject(torch.zeros(1, 64, 64, 4), True, SubjectSettings())
 
 
-def test_a_first_frame_without_a_subject_is_refused():
-    with pytest.raises(BadInput, match="first frame"):
-        prepare_subject(torch.cat([torch.zeros(1, 96, 96, 4), cutout()]), True, SubjectSettings())
+@pytest.mark.parametrize(
+    ("empty", "named"),
+    [
+        ([1], "frame 1 of 12 shows no subject; trim the video"),
+        ([3, 4], "frames 3 and 4 of 12 show no subject"),
+        (range(2, 12), "frames 2, 3, 4, 5, 6, 7, 8, 9 and 2 more of 12 show no subject"),
+    ],
+)
+def test_frames_without_a_subject_are_refused(empty, named):
+    frames = torch.cat([torch.zeros(1, 96, 96, 4) if number in empty else cutout() for number in range(1, 13)])
+    with pytest.raises(BadInput, match=named):
+        prepare_subject(frames, True, SubjectSettings())
 
 
 def test_a_subject_of_a_few_pixels_is_refused():
