@@ -25,7 +25,7 @@ INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an in
 SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
 SMOOTHNESS, KNOWN_SMOOTHNESS = 2.0, 1.0  # cells: of surfaces that the network guesses, and of those that are known
 LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
-HIDDEN_BRIGHTNESS = 0.9  # of hidden matter, relative to the picture: what the network says of it is too dark
+HIDDEN_BRIGHTNESS = 0.8  # of hidden matter, relative to the picture: what the network says of it is too dark
 LARGEST_GAIN, DARKEST = 2.0, 0.02  # of hidden colors, either way; luminance below which nothing is brighter
 
 
@@ -220,7 +220,7 @@ def picture_mask(picture: Float[Tensor, "4 128 128"]) -> Bool[Tensor, "128 128"]
 def as_bright_as(
     hidden: Float[Tensor, "128 128 64 3"], probability: Float[Tensor, "128 128 64"], picture: Float[Tensor, "4 128 128"]
 ) -> Float[Tensor, "128 128 64 3"]:
-    """Return hidden colors times one factor, with which they have 0.9 of the picture's brightness in the mean.
+    """Return hidden colors times one factor, with which they have 0.8 of the picture's brightness in the mean.
 
     Args:
         hidden: colors in [0, 1].
