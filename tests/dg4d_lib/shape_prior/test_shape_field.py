@@ -217,7 +217,9 @@ def test_oblong_pictures_are_refused():
     ("seen", "guessed", "expected"),
     [(0.5, 0.3, 0.4), (0.2, 0.3, 0.16), (0.9, 0.1, 0.2), (0.1, 0.9, 0.45), (0.9, 0.6, 0.72), (0.0, 0.0, 0.0)],
 )
-def test_hidden_colors_have_the_brightness_that_follows_from_the_picture(seen: float, guessed: float, expected: float) -> None:
+def test_hidden_colors_have_the_brightness_that_follows_from_the_picture(
+    seen: float, guessed: float, expected: float
+) -> None:
     """Of twice or half the brightness at most; where there is no matter, colors do not count."""
     picture = torch.zeros(4, SIZE, SIZE)
     picture[:, 40:80] = torch.tensor([seen, seen, seen, 1.0])[:, None, None]
