@@ -1,4 +1,4 @@
-"""Process identity, file locks, child environments and background guards."""
+"""Process identity, file locks, signals that are not lost, child environments and background guards."""
 
 import ctypes
 import fcntl
@@ -8,11 +8,14 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+
+REMINDER_S = 3.0  # after which a signal is sent again
 
 
 def start_of(pid: int) -> str:
@@ -118,3 +121,37 @@ def exit_guard(number: int, frame: FrameType | None) -> None:
 
 
 OWN_START = start_of(os.getpid())
+
+
+@contextmanager
+def repeated(number: signal.Signals) -> Iterator[None]:
+    """Send a signal again until the block has ended: what a handler raises in a finalizer or a callback of C is lost.
+
+    Outside of the main thread, and for signals without a handler, nothing changes.
+    """
+    handler = signal.getsignal(number)
+    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    main, ended, received = threading.get_ident(), threading.Event(), threading.Event()
+    restoring = threading.Lock()  # no reminder once the handler is back
+
+    def remind() -> None:
+        while not ended.wait(REMINDER_S):
+            with restoring:
+                if not ended.is_set():
+                    signal.pthread_kill(main, number)
+
+    def handle(given: int, frame: FrameType | None) -> None:
+        if not received.is_set():
+            received.set()
+            threading.Thread(target=remind, daemon=True).start()
+        handler(given, frame)
+
+    signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        with restoring:
+            ended.set()
+        signal.signal(number, handler)

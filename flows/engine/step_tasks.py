@@ -1,6 +1,7 @@
 """Prefect tasks of pipeline steps: cache key, retries, progress and artifacts in the UI."""
 
 import functools
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +33,7 @@ from flows.engine.running import RETRIES, RETRY_DELAY_S, fail_step, finish_step,
 from flows.formatting.escaping import markdown
 from flows.formatting.numbers import format_number
 from flows.packages.flow_result import StepRun
+from flows.processes import repeated
 from flows.step_errors import StepError
 from flows.ui import pages
 from flows.ui.showing import create_page, revive
@@ -95,7 +97,8 @@ def steps_of_flow() -> Iterator[None]:
     flow_run = UUID(runtime.flow_run.id)
     try:
         claim_run()
-        yield
+        with repeated(signal.SIGTERM):
+            yield
     except (KeyboardInterrupt, TerminationSignal):
         stop_all()  # Prefect waits for tasks in other threads
         raise

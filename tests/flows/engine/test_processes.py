@@ -1,11 +1,17 @@
-"""Processes are told apart, also those of containers that have the name of their host."""
+"""Processes are told apart, also those of containers that have the name of their host; lost signals come again."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
 
 import pytest
 
-from flows.processes import OWN_START, host_id, start_of
+from flows import processes
+from flows.processes import OWN_START, host_id, repeated, start_of
 
 HOSTNAME_TOO = "import socket; from flows.processes import host_id; print(socket.gethostname(), host_id())"
 
@@ -41,3 +47,45 @@ def test_the_start_of_a_process_is_known_as_long_as_it_lives() -> None:
     sleeping.kill()
     sleeping.wait()
     assert start_of(sleeping.pid) == ""
+
+
+class Told(BaseException):
+    """What a handler raises."""
+
+
+@pytest.fixture
+def handler(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, FrameType | None], None]]:
+    """Handle SIGUSR1 by raising, and remind soon."""
+
+    def tell(number: int, frame: FrameType | None) -> None:
+        raise Told
+
+    monkeypatch.setattr(processes, "REMINDER_S", 0.05)
+    before = signal.signal(signal.SIGUSR1, tell)
+    yield tell
+    signal.signal(signal.SIGUSR1, before)
+
+
+def test_a_signal_whose_exception_was_swallowed_is_sent_again(handler: Callable[..., None]) -> None:
+    began = time.monotonic()
+    with pytest.raises(Told), repeated(signal.SIGUSR1):
+        with pytest.raises(Told):  # stands for a finalizer, which swallows what it raises
+            os.kill(os.getpid(), signal.SIGUSR1)
+            time.sleep(10)
+        time.sleep(10)
+    assert time.monotonic() - began < 5
+    assert signal.getsignal(signal.SIGUSR1) is handler
+
+
+def test_a_signal_that_was_heard_is_not_sent_again(handler: Callable[..., None]) -> None:
+    with pytest.raises(Told), repeated(signal.SIGUSR1):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        time.sleep(10)
+    time.sleep(0.3)
+
+
+def test_a_signal_without_a_handler_keeps_its_default() -> None:
+    before = signal.signal(signal.SIGUSR1, signal.SIG_DFL)
+    with repeated(signal.SIGUSR1):
+        assert signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL
+    signal.signal(signal.SIGUSR1, before)
