@@ -125,7 +125,7 @@ OWN_START = start_of(os.getpid())
 
 @contextmanager
 def repeated(number: signal.Signals) -> Iterator[None]:
-    """Send a signal again until the block has ended: what a handler raises in a finalizer or a callback of C is lost.
+    """Send a signal again until the block has ended: what its handler raises may be lost, see `start_reminder`.
 
     Outside of the main thread, and for signals without a handler, nothing changes.
     """
@@ -133,19 +133,13 @@ def repeated(number: signal.Signals) -> Iterator[None]:
     if not callable(handler) or threading.current_thread() is not threading.main_thread():
         yield
         return
-    main, ended, received = threading.get_ident(), threading.Event(), threading.Event()
+    ended, received = threading.Event(), threading.Event()
     restoring = threading.Lock()  # no reminder once the handler is back
-
-    def remind() -> None:
-        while not ended.wait(REMINDER_S):
-            with restoring:
-                if not ended.is_set():
-                    signal.pthread_kill(main, number)
 
     def handle(given: int, frame: FrameType | None) -> None:
         if not received.is_set():
             received.set()
-            threading.Thread(target=remind, daemon=True).start()
+            start_reminder(number, ended, restoring)
         handler(given, frame)
 
     signal.signal(number, handle)
@@ -155,3 +149,19 @@ def repeated(number: signal.Signals) -> Iterator[None]:
         with restoring:
             ended.set()
         signal.signal(number, handler)
+
+
+def start_reminder(number: signal.Signals, ended: threading.Event, restoring: threading.Lock) -> None:
+    """Send a signal to this thread every `REMINDER_S` seconds until `ended`, never while `restoring` is held.
+
+    An exception that a handler raises within a finalizer or a callback of C code is lost.
+    """
+    thread = threading.get_ident()
+
+    def remind() -> None:
+        while not ended.wait(REMINDER_S):
+            with restoring:
+                if not ended.is_set():
+                    signal.pthread_kill(thread, number)
+
+    threading.Thread(target=remind, daemon=True).start()

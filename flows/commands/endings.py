@@ -24,13 +24,11 @@ from flows.exit_status import (
     EXIT_PIPE,
     EXIT_TERMINATED,
 )
+from flows.processes import start_reminder
 
 __all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
-REMINDER_S = (
-    3.0  # an exception raised within a finalizer or a callback of C code is lost; it is raised again after this
-)
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; run the same command again to continue after the last finished step"
 
@@ -80,15 +78,9 @@ def _signals() -> Iterator[list[signal.Signals]]:
     def stop(number: int, frame: FrameType | None) -> None:
         received.append(signal.Signals(number))
         if len(received) == 1:
-            threading.Thread(target=remind, args=(threading.get_ident(),), daemon=True).start()
+            start_reminder(received[0], ended, restoring)
         if not ended.is_set() and not _is_unwinding():  # later signals must not interrupt the cleanup
             raise Terminated(received[0])
-
-    def remind(main: int) -> None:
-        while not ended.wait(REMINDER_S):
-            with restoring:
-                if not ended.is_set():
-                    signal.pthread_kill(main, received[0])
 
     before = {}
     if threading.current_thread() is threading.main_thread():

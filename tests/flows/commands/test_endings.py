@@ -10,6 +10,7 @@ import pytest
 import typer
 
 from dg4d_lib.errors import DG4DError
+from flows import processes
 from flows.commands import endings
 from flows.engine.item_runs import ItemFailed
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_HANGUP, EXIT_STATUS, EXIT_TERMINATED
@@ -20,7 +21,7 @@ from flows.studio.drafts import TooLarge
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(endings, "REMINDER_S", 0.05)
+    monkeypatch.setattr(processes, "REMINDER_S", 0.05)
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # `nohup` ignores it
     yield
     signal.signal(signal.SIGHUP, before)

@@ -50,7 +50,7 @@ def test_the_start_of_a_process_is_known_as_long_as_it_lives() -> None:
 
 
 class Told(BaseException):
-    """What a handler raises."""
+    """Exception of the handler under test."""
 
 
 @pytest.fixture
