@@ -1,14 +1,17 @@
 """Video reader on PyAV, in two passes: count the frames, then decode and shrink the selected ones."""
 
 import math
+import struct
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import av
 import torch
 from av.error import FFmpegError
+from av.sidedata.sidedata import SideData
 from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from jaxtyping import Float, UInt8
@@ -32,6 +35,10 @@ MOST_STRETCHED = 4.0  # ratio of the sides of a pixel; more extreme values of a 
 UNEVEN = 0.05  # share of the duration by which frames may be played before or after their time without a note
 HDR_CURVES = (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67)  # PQ and HLG
 WIDE_PRIMARIES = (ColorPrimaries.BT2020, ColorPrimaries.SMPTE432)  # the second is Display P3
+ANIMATIONS = ("gif", "apng")  # containers whose shortest frames browsers show longer
+FASTEST_MS = 10  # browsers show frames of animations that are this short or shorter for `SLOWED_MS`
+SLOWED_MS = 100
+APNG_OPTIONS = {"default_fps": str(1000 // SLOWED_MS)}  # rate of frames without a duration
 ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # FFmpeg's own decoders drop the alpha plane of WebM
 
 
@@ -51,6 +58,13 @@ def measured_rate(times: Sequence[float]) -> float:
     """Return the mean frame rate between the first and the last of the times in seconds; 0 if they do not differ."""
     span = times[-1] - times[0] if times else 0.0
     return (len(times) - 1) / span if span > 0 else 0.0
+
+
+def shown_times(times: Sequence[float]) -> list[float]:
+    """Return the times, in seconds, at which browsers show the frames of an animation with these times."""
+    gaps_ms = [(later - time) * 1000 for time, later in pairwise(times)]
+    slowed = [SLOWED_MS if round(gap, 3) <= FASTEST_MS else gap for gap in gaps_ms]
+    return [total / 1000 for total in accumulate(slowed, initial=0.0)]
 
 
 def uneven_note(times: Sequence[float]) -> tuple[str, ...]:
@@ -121,6 +135,7 @@ class Clip:
                 f"the video is cut off or broken: none of its {self.announced} frames can be read; copy it again"
             )
         known = [time for time in times if time is not None]
+        known = shown_times(known) if container in ANIMATIONS else known
         self.fps, self.notes = self._rate(known), uneven_note(known)
 
     def read(self, indices: Sequence[int]) -> tuple[Float[Tensor, "t h w 4"], bool]:
@@ -132,13 +147,16 @@ class Clip:
                 width, height = max(1, round(frame.width * self._pixel_aspect)), frame.height
                 check_size(width, height, "the video")
                 kept.add(i, _picture(frame, width, kept.side, has_alpha, colors))
-                self.size = (height, width) if round(frame.rotation / 90) % 2 else (width, height)
+                self.size = (height, width) if _orientation(frame).is_transposed else (width, height)
         self.notes = (*self.notes, *colors.notes)
         return kept.frames, has_alpha
 
     def _frames(self) -> Iterator[av.VideoFrame]:
         try:
-            with av.open(str(self._path), format=self._container, metadata_errors="replace") as container:
+            options = APNG_OPTIONS if self._container == "apng" else {}
+            with av.open(
+                str(self._path), format=self._container, options=options, metadata_errors="replace"
+            ) as container:
                 if not container.streams.video:
                     found = "holds only sound or other tracks" if len(container.streams) else "is cut off or broken"
                     raise BadInput(f"the video {found}: there are no pictures in it; give another file")
@@ -220,4 +238,23 @@ def _picture(frame: av.VideoFrame, width: int, side: int, has_alpha: bool, color
     size = (frame.width, frame.height) if has_alpha else (width, height)  # FFmpeg's scaler does not weight by alpha
     picture = downscale_in_bands(colors.pixels(frame, *size), side)
     picture = resample(picture[None], height, width)[0]
-    return torch.rot90(picture, round(frame.rotation / 90)).contiguous()
+    is_transposed, flipped = _orientation(frame)
+    return (picture.transpose(0, 1) if is_transposed else picture).flip(flipped).contiguous()
+
+
+class _Orientation(NamedTuple):
+    """Steps that show a frame upright: swap rows and columns, then reverse these axes."""
+
+    is_transposed: bool = False
+    flipped: tuple[int, ...] = ()
+
+
+def _orientation(frame: av.VideoFrame) -> _Orientation:
+    """Return the nearest right-angled turn or mirror image of a frame's display matrix."""
+    matrix = cast(SideData | None, frame.side_data.get("DISPLAYMATRIX"))
+    if matrix is None:
+        return _Orientation()
+    a, b, _, c, d = struct.unpack_from("=5i", matrix)  # rows of pixels run along (a, b), columns along (c, d)
+    is_transposed = abs(b) > abs(a)
+    along_x, along_y = (c, b) if is_transposed else (a, d)
+    return _Orientation(is_transposed, tuple(axis for axis, way in enumerate((along_y, along_x)) if way < 0))

@@ -41,9 +41,14 @@ def place_pictures(
             pixels a side.
 
     Raises:
-        BadInput: the cameras look away from the subject, from above, or two of them are one.
+        BadInput: the cameras look away from the subject, from above, or two of them are one; or a picture has another
+            shape than that of its camera.
     """
     assert given.input_camera is not None, "placed views need the camera of the input"
+    given.input_camera.check_shape(source.size, "the input")
+    for view, file in zip(given.views, sources, strict=True):
+        if view.camera is not None:
+            view.camera.check_shape(file.size, view.name)
     cameras = [given.input_camera, *(view.camera for view in given.views if view.camera is not None)]
     poses = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
     size = inputs.shape[1]

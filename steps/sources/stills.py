@@ -16,6 +16,7 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import to_srgb
 from dg4d_lib.video.downscaling import BAND_BYTES, BandDownscaler
+from steps.sources.channels import find_channels
 from steps.sources.color_profiles import convert_to_srgb
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.still_headers import read_header
@@ -35,7 +36,7 @@ TIFF_LAB = (8, 9, 10)  # CIE Lab, ICC Lab, ITU Lab
 
 FLOATS = ("half", "float", "double")
 HALF = 0.5  # alpha from which a pixel has a value
-DEPTH_NAMES = ("z", "depth", "depth.z", "depth.v")  # of channels, or their ends after a dot; before red, green and blue
+WINDOWED_FORMATS = ("openexr",)  # data and display windows differ; offsets of TIFF and PNG are places on a page
 LINEAR_FORMATS = ("openexr", "hdr")
 PREMULTIPLIED_FORMATS = ("openexr", "tiff")  # unless a file says otherwise
 FAINT_ALPHA = 1e-3  # premultiplied colors are divided by no smaller alpha
@@ -55,7 +56,7 @@ class StillPicture(NamedTuple):
         pixels: straight sRGB and alpha in [0, 1], upright.
         has_alpha: True if the file has an alpha channel.
         size: width and height of the upright file, before shrinking.
-        notes: sentences for the report about colors.
+        notes: sentences for the report about layers and colors.
     """
 
     pixels: Float[Tensor, "h w 4"]
@@ -107,7 +108,7 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
         spec = file.spec()
         _check_kind(file, what)
         still = _Still(file, what)
-        limit.require(still.needed_bytes(held), what, spec.width, spec.height)
+        limit.require(still.needed_bytes(held), what, still.width, still.height)
         shrinker = BandDownscaler(still.height, still.width, longest)
         for top, band in still.bands():
             shrinker.add(top, torch.from_numpy(band))
@@ -117,7 +118,7 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
     is_profile = isinstance(profile, ndarray) and not still.is_linear  # a comment of a file may have this name, too
     notes = convert_to_srgb(picture, profile.tobytes()) if is_profile else ()
     orientation = int(spec.get_int_attribute("Orientation", 1))
-    return _upright(picture, still.has_alpha, orientation, (still.width, still.height), notes)
+    return _upright(picture, still.has_alpha, orientation, (still.width, still.height), (*still.notes, *notes))
 
 
 class StillValues(NamedTuple):
@@ -125,7 +126,7 @@ class StillValues(NamedTuple):
 
     Attributes:
         values: as stored; integers in [0, 1] of their range.
-        known: pixels that are finite, and not transparent.
+        known: pixels that are finite, not transparent, and in the data window.
         is_float: True if the file holds floating-point numbers.
         tint: mean difference of the color channels, where known.
         size: width and height of the upright file.
@@ -158,7 +159,7 @@ def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: i
         spec = file.spec()
         _check_kind(file, what)
         still = _Still(file, what, depth=True)
-        limit.require(still.needed_bytes(held), what, spec.width, spec.height)
+        limit.require(still.needed_bytes(held), what, still.width, still.height)
         orientation = int(spec.get_int_attribute("Orientation", 1))
         if orientation in TRANSPOSED:
             height, width = width, height
@@ -181,12 +182,25 @@ def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: i
 def _check_kind(file: oiio.ImageInput, what: str) -> None:
     """Refuse sizes out of range, deep pictures, volumes and Lab colors, which libtiff converts with a yellow cast."""
     spec = file.spec()
-    check_size(spec.width, spec.height, what)
+    check_size(*_display_window(file)[2:], what)
+    if spec.width * spec.height > MOST_PIXELS:
+        raise BadInput(
+            f"{what} stores {spec.width} x {spec.height} pixels in its data window; at most "
+            f"{MOST_PIXELS // 1_000_000} million are read: crop the data window to the display window"
+        )
     if spec.deep or spec.depth > 1:
         kind = "has several samples per pixel (deep data)" if spec.deep else "is a volume of several slices"
         raise BadInput(f"{what} {kind}, which cannot be read here; export it flattened, as PNG or EXR")
     if file.format_name() == "tiff" and spec.get_int_attribute(PHOTOMETRIC, 0) in TIFF_LAB:
         raise BadInput(f"{what} is a TIFF with Lab colors, which cannot be read here; export it with RGB colors")
+
+
+def _display_window(file: oiio.ImageInput) -> tuple[int, int, int, int]:
+    """Return first column and row, width and height of the display window; only OpenEXR has one beside its data."""
+    spec = file.spec()
+    if file.format_name() in WINDOWED_FORMATS:
+        return spec.full_x, spec.full_y, spec.full_width, spec.full_height
+    return spec.x, spec.y, spec.width, spec.height
 
 
 def _nearest(count: int, length: int) -> ndarray:
@@ -252,17 +266,19 @@ class _Still:
     """An open picture, read in bands of rows.
 
     Attributes:
-        width: pixels, as stored.
-        height: pixels, as stored.
+        width: of the display window in pixels, not yet upright.
+        height: likewise.
         has_alpha: True if the file has an alpha channel.
         is_linear: True if it holds linear light.
+        notes: a sentence about the layer.
     """
 
     def __init__(self, file: oiio.ImageInput, what: str, depth: bool = False) -> None:
         """Find the channels; with `depth` one that is named so goes before colors."""
         self._file, self._what, self._spec = file, what, file.spec()
-        self.width, self.height = self._spec.width, self._spec.height
-        self._channels, self.has_alpha = _rgba_channels(self._spec, depth)
+        left, top, self.width, self.height = _display_window(file)
+        self._left, self._top = self._spec.x - left, self._spec.y - top  # of the data window in it
+        self._channels, self.has_alpha, self.notes = find_channels(self._spec, depth)
         self.is_linear = file.format_name() in LINEAR_FORMATS or str(self._spec.format) in FLOATS
         self._is_premultiplied = (
             self.has_alpha
@@ -273,13 +289,12 @@ class _Still:
         self._rows = self._rows_at_once()
 
     def bands(self) -> Iterator[tuple[int, Float[ndarray, "rows w 4"]]]:
-        """Yield the first row of every band, and its straight sRGB and alpha in [0, 1].
+        """Yield the first row of every band, and its straight sRGB and alpha in [0, 1]; black outside the data.
 
         Raises:
             BadInput: the file is cut off or broken.
         """
-        for top in range(0, self.height, self._rows):
-            pixels = self._pixels(top, min(self._rows, self.height - top))
+        for top, pixels in self._displayed(outside=0.0):
             picture = _as_rgba(pixels, [channel - self._first for channel in self._channels])
             if self._is_premultiplied:
                 picture[..., :3] /= np.maximum(picture[..., 3:], FAINT_ALPHA)
@@ -288,26 +303,53 @@ class _Still:
             yield top, picture.clip(0, 1)
 
     def value_bands(self) -> Iterator[tuple[int, Float[ndarray, "rows w 4"]]]:
-        """Yield the first row of every band, and three channels and alpha as they are stored.
+        """Yield the first row of every band, and three channels and alpha as they are stored; NaN outside the data.
 
         Raises:
             BadInput: the file is cut off or broken.
         """
-        for top in range(0, self.height, self._rows):
-            pixels = self._pixels(top, min(self._rows, self.height - top))
+        for top, pixels in self._displayed(outside=np.nan):
             picked = [channel - self._first for channel in self._channels]
             yield top, np.concatenate([pixels[..., picked], np.ones((*pixels.shape[:2], 4 - len(picked)))], -1)
+
+    def _displayed(self, outside: float) -> Iterator[tuple[int, Float[ndarray, "rows w c"]]]:
+        """Yield bands of the display window, each with its first row; pixels beside the data window are `outside`."""
+        done = 0
+        for top in range(0, self._spec.height, self._rows):
+            rows, offset = min(self._rows, self._spec.height - top), self._top + top
+            first, last = max(0, offset), min(self.height, offset + rows)
+            if first < last:
+                yield from self._empty_rows(done, first, outside)
+                yield first, self._fit_columns(self._pixels(top, rows)[first - offset : last - offset], outside)
+                done = last
+        yield from self._empty_rows(done, self.height, outside)
+
+    def _empty_rows(self, first: int, last: int, outside: float) -> Iterator[tuple[int, Float[ndarray, "rows w c"]]]:
+        """Yield bands of rows above or below the data window."""
+        for top in range(first, last, self._rows):
+            yield top, np.full((min(self._rows, last - top), self.width, self._last - self._first), outside, np.float32)
+
+    def _fit_columns(self, pixels: Float[ndarray, "rows data_w c"], outside: float) -> Float[ndarray, "rows w c"]:
+        """Crop and pad rows of the data window to the width of the display window."""
+        if (self._left, pixels.shape[1]) == (0, self.width):
+            return pixels
+        fitted = np.full((len(pixels), self.width, pixels.shape[2]), outside, np.float32)
+        first, last = max(0, self._left), min(self.width, self._left + pixels.shape[1])
+        if first < last:
+            fitted[:, first:last] = pixels[:, first - self._left : last - self._left]
+        return fitted
 
     def _rows_at_once(self) -> int:
         """Return the height of a band: whole tiles, or whole compressed blocks if they are small enough."""
         spec = self._spec
         if spec.tile_width:
             return int(spec.tile_height)
-        rows = max(1, BAND_BYTES // (4 * self.width * (self._last - self._first)))
+        widest = max(self.width, spec.width)
+        rows = max(1, BAND_BYTES // (4 * widest * (self._last - self._first)))
         block = spec.get_int_attribute("oiio:RowsPerChunk", 1)
-        if self._file.format_name() == "openexr" or block * self.width * spec.pixel_bytes(True) <= BAND_BYTES:
+        if self._file.format_name() == "openexr" or block * widest * spec.pixel_bytes(True) <= BAND_BYTES:
             rows = -(-rows // block) * block
-        return min(rows, self.height)
+        return min(rows, max(self.height, spec.height))
 
     def needed_bytes(self, held: float) -> float:
         """Return an estimate of the memory of the decoder, a band, its copies and the result.
@@ -316,42 +358,27 @@ class _Still:
             held: bytes per pixel that the decoder holds, as far as the header tells.
         """
         spec, pixels = self._spec, self.width * self.height
-        band = self._rows * max(self.width, -(-self.width // max(1, spec.tile_width)) * spec.tile_width)
+        band = self._rows * max(self.width, spec.width, -(-spec.width // max(1, spec.tile_width)) * spec.tile_width)
         native = spec.pixel_bytes(True)
         held = max(held, HELD_BYTES.get(self._file.format_name(), 0.0))
         if spec.get_int_attribute(PHOTOMETRIC, 0) == TIFF_YCBCR:
             held = max(held, 4.0)  # libtiff converts the whole picture to 8-bit RGBA
         work = band * (2 * native + 4 * (self._last - self._first) + COPIES * 16)
-        return held * pixels + work + 16 * min(pixels, LARGEST_SIDE**2)
+        return held * spec.width * spec.height + work + 16 * min(pixels, LARGEST_SIDE**2)
 
-    def _pixels(self, top: int, rows: int) -> Float[ndarray, "rows w c"]:
-        """Read a band of the channels that are needed."""
+    def _pixels(self, top: int, rows: int) -> Float[ndarray, "rows data_w c"]:
+        """Read a band of the data window, with the channels that are needed."""
         spec, begin = self._spec, self._spec.y + top
         channels = (self._first, self._last)
         if spec.tile_width:
-            across = (spec.x, spec.x + self.width, begin, begin + rows)
+            across = (spec.x, spec.x + spec.width, begin, begin + rows)
             pixels = self._file.read_tiles(0, 0, *across, spec.z, spec.z + 1, *channels, "float")
         else:
             pixels = self._file.read_scanlines(0, 0, begin, begin + rows, spec.z, *channels, "float")
         reason = self._file.geterror()
         if pixels is None or "remature end" in reason:
             raise BadInput(f"{self._what} is cut off or broken: {_reason(reason)}; copy or export it again")
-        return np.asarray(pixels, np.float32).reshape(rows, self.width, -1)
-
-
-def _rgba_channels(spec: oiio.ImageSpec, depth: bool = False) -> tuple[list[int], bool]:
-    """Find red, green, blue and alpha, if present; gray is repeated, depth and the like are ignored unless wanted."""
-    names = [name.lower() for name in spec.channelnames]
-    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else names.index("a") if "a" in names else -1
-    rest = [i for i in range(len(names)) if i != alpha] or [0]
-    deep = [i for i, name in enumerate(names) if name.endswith(tuple(f".{end}" for end in DEPTH_NAMES))]
-    if depth and (deep := [i for i, name in enumerate(names) if name in DEPTH_NAMES] or deep):
-        colors = deep[:1] * 3
-    elif all(name in names for name in "rgb"):
-        colors = [names.index(name) for name in "rgb"]
-    else:
-        colors = rest[:3] if len(rest) >= 3 else rest[:1] * 3
-    return ([*colors, alpha], True) if alpha >= 0 else (colors, False)
+        return np.asarray(pixels, np.float32).reshape(rows, spec.width, -1)
 
 
 def _as_rgba(pixels: Float[ndarray, "h w c"], channels: list[int]) -> Float[ndarray, "h w 4"]:

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from dg4d_lib.errors import BadInput, quoted
 from steps.artifacts.archives import stays_inside
@@ -18,6 +18,7 @@ LARGEST_JSON = 16 * 2**20  # bytes
 MOST_VIEWS = 64  # pictures or cameras
 CLOSE_DEG = 2.0  # two views nearer to each other count as one
 HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth says nothing
+OTHER_SHAPE = 0.02  # ratio of width to height by which picture and camera may differ: rounding after shrinking
 DISTORTED = 0.05  # largest lens distortion coefficient that is ignored
 
 
@@ -28,11 +29,33 @@ class PlacedCamera(Frozen):
         matrix: camera to world, OpenGL axes (x right, y up, z backward).
         focal: focal length, in widths of the picture.
         center: principal point, in widths and heights of the picture.
+        size: width and height of the picture, pixels; None if unknown.
     """
 
     matrix: tuple[tuple[float, float, float, float], ...]
     focal: float = Field(gt=0)
     center: tuple[float, float] = (0.5, 0.5)
+    size: tuple[PositiveInt, PositiveInt] | None = None
+
+    def check_shape(self, size: tuple[int, int], name: str) -> None:
+        """Refuse a picture of another shape than that of the camera: its focal length would be wrong.
+
+        Args:
+            size: width and height of the upright picture, pixels.
+            name: of the picture, for the message.
+
+        Raises:
+            BadInput: names both sizes.
+        """
+        if self.size is None:
+            return
+        ratio = size[0] * self.size[1] / (size[1] * self.size[0])
+        if max(ratio, 1 / ratio) > 1 + OTHER_SHAPE:
+            raise BadInput(
+                f"{name} is {size[0]} x {size[1]} pixels, its camera {self.size[0]} x {self.size[1]}: give the picture "
+                "that the camera was computed from, without a turn in its EXIF data, or correct w and h in "
+                "transforms.json"
+            )
 
 
 class GivenView(Frozen):
@@ -211,7 +234,8 @@ class Transforms(_Intrinsics):
                 "radians"
             )
         center = (x / width if x and width else 0.5, y / height if y and height else 0.5)
-        return PlacedCamera(matrix=frame.transform_matrix[:3], focal=share, center=center)
+        size = (width, height) if width and height else None
+        return PlacedCamera(matrix=frame.transform_matrix[:3], focal=share, center=center, size=size)
 
 
 def read_transforms(path: Path) -> Transforms:

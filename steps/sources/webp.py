@@ -11,7 +11,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from steps.sources.clips import MOST_DECODED, MOST_FRAMES, measured_rate
+from steps.sources.clips import FASTEST_MS, MOST_DECODED, MOST_FRAMES, SLOWED_MS, measured_rate
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.decoder_errors import damage_is_bad_input
 from steps.sources.stills import check_size
@@ -22,7 +22,6 @@ CHUNK_BYTES = (10).to_bytes(4, "little")  # length of a VP8X chunk, before its f
 ANIMATION_FLAG = 0x02
 FILE_COPIES = 3  # copies of the file that Pillow holds while it opens one
 CANVAS_BYTES = 28  # per pixel: two canvases of libwebp, Pillow's copies, and planes of the current frame
-FASTEST_FPS = 10.0  # rate of files whose frames have no duration
 
 
 def is_animated(content: bytes) -> bool:
@@ -59,8 +58,8 @@ class AnimatedWebp:
 
     @property
     def fps(self) -> float:
-        """Mean frame rate of the frames read so far; `FASTEST_FPS` if they have no duration."""
-        return measured_rate(self.times) or FASTEST_FPS
+        """Mean frame rate of the frames read so far; 0 before the second."""
+        return measured_rate(self.times)
 
     def __len__(self) -> int:
         return int(self._image.n_frames)
@@ -73,5 +72,6 @@ class AnimatedWebp:
                 self._image.seek(number)
                 frame = torch.from_numpy(np.array(self._image.convert("RGBA")))
             self.times.append(start_ms / 1000)
-            start_ms += self._image.info["duration"]
+            duration_ms = self._image.info["duration"]
+            start_ms += duration_ms if duration_ms > FASTEST_MS else SLOWED_MS
             yield frame

@@ -197,6 +197,17 @@ def test_pictures_of_known_cameras_may_show_the_subject_small(tmp_path):
     assert (found[0] - found[1]).abs().mean() < 0.01
 
 
+@pytest.mark.parametrize("turned", ["the input", "side.png"])
+def test_a_picture_of_another_shape_than_its_camera_is_refused(turned, tmp_path):
+    place = Workplace(tmp_path, seen(creature(), 0))
+    files = {"000": png(seen(creature(), 75), tmp_path)}
+    sizes = [(960, 640) if turned == name else (2 * SIZE, 2 * SIZE) for name in ("the input", "side.png")]
+    own, side = (placed(at).model_copy(update={"size": size}) for at, size in zip((0, 75), sizes, strict=True))
+    given = GivenViews(views=(GivenView(file="000", name="side.png", camera=side),), input_camera=own)
+    with pytest.raises(BadInput, match=rf"{turned} is {SIZE} x {SIZE} pixels, its camera 960 x 640: .*EXIF"):
+        place.prepare(given, files)
+
+
 def test_synchronized_videos_get_the_exposure_of_the_input_in_all_frames(tmp_path):
     place = Workplace(tmp_path, clip(tmp_path, [0.0] * 2))
     views = tuple(GivenView(file=f, name=f, camera=placed(a)) for f, a in (("00", 75), ("01", 200)))

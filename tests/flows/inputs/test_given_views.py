@@ -1,5 +1,6 @@
 import json
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -113,7 +114,14 @@ def test_of_files_of_one_name_the_input_itself_names_its_camera(tmp_path):
 def test_focal_lengths_are_in_widths_of_the_picture(tmp_path):
     own = read_transforms(transforms(tmp_path, "a.png", "b.png", fl_x=400, w=800, h=600, cx=200, cy=300))
     camera = own.camera(own.frames[0])
-    assert camera.focal == 0.5 and camera.center == (0.25, 0.5)
+    assert camera.focal == 0.5 and camera.center == (0.25, 0.5) and camera.size == (800, 600)
+
+
+@pytest.mark.parametrize(("size", "refused"), [((400, 300), False), ((401, 300), False), ((600, 800), True)])
+def test_a_picture_may_be_smaller_than_its_camera_says_but_not_of_another_shape(tmp_path, size, refused):
+    own = read_transforms(transforms(tmp_path, "a.png", "b.png", fl_x=400, w=800, h=600))
+    with pytest.raises(BadInput, match="600 x 800 pixels, its camera 800 x 600") if refused else nullcontext():
+        own.camera(own.frames[0]).check_shape(size, "a.png")
 
 
 @pytest.mark.parametrize(
