@@ -124,4 +124,4 @@ def _parsed(path: Path) -> Any:
 def _text(path: Path) -> str:
     if path.stat().st_size > LARGEST_TEXT_BYTES:
         raise BadInput(f"--asset: {path} has more than {LARGEST_TEXT_BYTES} bytes of text; export it as GLB")
-    return path.read_bytes().decode("utf-8", "replace")
+    return path.read_bytes().decode("utf-8-sig", "replace")

@@ -24,6 +24,7 @@ from dg4d_lib.assets.formats.ply_mesh import declared_faces, read_ply_mesh
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.merging import merge_gaussians
+from dg4d_lib.mesh.models.model import Model
 from steps.artifacts.archives import stays_inside, unpack
 from steps.sources.decode_limit import DecodeLimit
 
@@ -85,13 +86,13 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
         case ".glb" | ".gltf":
             return _mesh(embed_files(file), settings)
         case ".obj":
-            text = file.read_bytes().decode("utf-8", "replace")
+            text = file.read_bytes().decode("utf-8-sig", "replace")
             model = read_obj(text, lambda name: _beside(file.parent, name), decode_picture, settings.max_faces)
-            return _mesh(write_model_glb(model), settings, ("y", "z"))
+            return _converted(model, settings, ("y", "z"))
         case _:
             usd: Any = import_module("dg4d_lib.assets.formats.usd_model")  # the USD library starts slowly
             usd.check_usdz(file)
-            return _mesh(write_model_glb(usd.read_usd(file, decode_picture, settings.max_faces)), settings)
+            return _converted(usd.read_usd(file, decode_picture, settings.max_faces), settings)
 
 
 def _merged(own: OwnModel, most: int) -> OwnModel:
@@ -106,9 +107,15 @@ def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
     """Return a mesh where the file has faces, and splats where it has none."""
     if declared_faces(content):
         model = read_ply_mesh(content, lambda name: _beside(folder, name), decode_picture, settings.max_faces)
-        return _mesh(write_model_glb(model), settings, ("y", "z"))
+        return _converted(model, settings, ("y", "z"))
     splats, notes = read_foreign_ply(content)
     return OwnModel(splats=splats, ups=("-y", "y", "z"), notes=notes)  # 3DGS has y down
+
+
+def _converted(model: Model, settings: AssetSettings, ups: tuple[str, ...] = ("y",)) -> OwnModel:
+    """Return a model of another format as GLB."""
+    own = _mesh(write_model_glb(model), settings, ups)
+    return replace(own, notes=(*model.notes, *own.notes))
 
 
 def _mesh(content: bytes, settings: AssetSettings, ups: tuple[str, ...] = ("y",)) -> OwnModel:

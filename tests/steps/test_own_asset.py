@@ -35,7 +35,7 @@ from steps.artifacts.rendering import read_surface
 from steps.catalog import STEPS
 from steps.profiles import PREVIEW, revise, step_settings
 from steps.runtime.job import Job
-from steps.sources.models import embed_files
+from steps.sources.models import embed_files, read_model
 
 SMALL = revise(
     PREVIEW,
@@ -367,3 +367,13 @@ def test_too_many_triangles_of_an_obj_are_refused(tmp_path: Path) -> None:
     path = zipped(tmp_path, model_obj=text.encode())
     with pytest.raises(BadInput, match=r"more than 100 triangles.*asset\.max_faces"):
         prepare_asset.run(job_of("prepare_asset", tmp_path / "out", {"model": path}, settings))
+
+
+def test_an_obj_after_a_byte_order_mark_has_its_materials_and_what_is_missing_is_noted(tmp_path: Path) -> None:
+    text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl A\nf 1 2 3\nusemtl B\nf 3 2 1\n"
+    materials = "newmtl A\nKd 1 0 0\n"
+    path = zipped(tmp_path, model_obj=text.encode("utf-8-sig"), a_mtl=materials.encode("utf-8-sig"))
+    (tmp_path / "scratch").mkdir()
+    own = read_model(path, tmp_path / "scratch", SMALL.asset, 1.0)
+    assert own.glb is not None and own.glb.model.parts[0].factor == (1, 0, 0)
+    assert own.notes == ("no color was found for the materials 'B'",)

@@ -3,7 +3,6 @@
 Files are not trusted: every index, size and number is checked before it is used.
 """
 
-import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dg4d_lib.assets.formats import draco
-from dg4d_lib.assets.formats.foreign_nodes import Matrices, flattening, global_matrices, mesh_matrices, transform_points
+from dg4d_lib.assets.formats.foreign_materials import BaseColors, is_transparent
+from dg4d_lib.assets.formats.foreign_nodes import (
+    Matrices,
+    flattening,
+    global_matrices,
+    invisible_nodes,
+    mesh_matrices,
+    move_roots,
+    transform_points,
+)
 from dg4d_lib.assets.formats.gltf import GlbReader, json_object, read_accessor
-from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.model import Model, ModelPart, far_center, moved_note
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 MORPHED = ("POSITION", "NORMAL", "TANGENT")  # attributes whose morph targets are read
@@ -26,7 +33,6 @@ UNREADABLE = {
     "KHR_meshopt_compression": "it is compressed with KHR_meshopt_compression; export it without compression",
     "KHR_texture_basisu": "its textures are in KTX2; export them as PNG or JPEG",
 }
-SPECULAR = "KHR_materials_pbrSpecularGlossiness"  # materials of older exporters
 _FOREIGN = (KeyError, IndexError, TypeError, ValueError, ArithmeticError, AttributeError, OSError, struct.error)
 
 
@@ -112,36 +118,52 @@ def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
             raise BadInput(f"the model cannot be read: {remedy}")
     draco.unpack_draco(reader)
     globals_ = global_matrices(tree)
-    nodes = [n for n in sorted(globals_) if "mesh" in tree["nodes"][n] and not _hidden(tree["nodes"][n], globals_[n])]
-    faces, notes = 0, []
+    invisible = invisible_nodes(tree, globals_)
+    nodes = [
+        node
+        for node in sorted(globals_)
+        if "mesh" in tree["nodes"][node]
+        and node not in invisible
+        and not _has_no_scale(tree["nodes"][node], globals_[node])
+    ]
+    shown, faces, notes = [], 0, []
     for node in nodes:
-        for primitive in tree["meshes"][tree["nodes"][node]["mesh"]]["primitives"]:
+        mesh = tree["meshes"][tree["nodes"][node]["mesh"]]
+        for number, primitive in enumerate(mesh["primitives"]):
+            if is_transparent(tree, primitive):
+                continue
+            if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
+                notes.append(f"points and lines of {mesh.get('name', 'a mesh')!r} are not animated and left out")
+                continue
             count = tree["accessors"][primitive.get("indices", primitive["attributes"]["POSITION"])]["count"]
-            most = {TRIANGLES: count // 3, STRIP: count - 2, FAN: count - 2}
-            faces += max(0, most.get(primitive.get("mode", TRIANGLES), 0))
+            faces += max(0, count // 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else count - 2)
+            shown.append((node, number))
     if faces > max_faces:
         raise BadInput(
             f"the model has {faces} triangles; asset.max_faces allows {max_faces}: simplify it, or raise the limit "
             f"with --set asset.max_faces={faces}"
         )
-    pieces: list[Piece] = []
-    pictures: dict[int, NDArray[np.uint8]] = {}
-    for node in nodes:
-        mesh = tree["meshes"][tree["nodes"][node]["mesh"]]
-        for number, primitive in enumerate(mesh["primitives"]):
-            if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
-                notes.append(f"points and lines of {mesh.get('name', 'a mesh')!r} are not animated and left out")
-                continue
-            pieces.append(_piece(reader, node, number, globals_, pictures))
-    pieces = [piece for piece in pieces if len(piece.part.faces)]
-    if not pieces:
-        raise BadInput("the model shows no triangles; give a mesh with faces")
+    colors = BaseColors(reader)
+    pieces = _pieces(reader, shown, globals_, colors)
+    center = far_center(np.concatenate([piece.part.vertices for piece in pieces]))
+    if center.any():
+        move_roots(tree, -center)
+        pieces = _pieces(reader, shown, global_matrices(tree), colors)
+        notes.append(moved_note(center))
     if not all(np.isfinite(piece.part.vertices).all() for piece in pieces):
         raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
     return ForeignGlb(reader, tuple(pieces), tuple(dict.fromkeys(notes)))
 
 
-def _hidden(node: dict[str, Any], matrix: NDArray[np.float64]) -> bool:
+def _pieces(reader: GlbReader, shown: Sequence[tuple[int, int]], globals_: Matrices, colors: BaseColors) -> list[Piece]:
+    """Return the pieces with triangles, of the given nodes and primitives."""
+    pieces = [_piece(reader, node, number, globals_, colors) for node, number in shown]
+    if not any(len(piece.part.faces) for piece in pieces):
+        raise BadInput("the model shows no triangles; give a mesh with faces")
+    return [piece for piece in pieces if len(piece.part.faces)]
+
+
+def _has_no_scale(node: dict[str, Any], matrix: NDArray[np.float64]) -> bool:
     """Tell if a scale of 0 hides a mesh, as where frames are shown in turn; skinned ones follow their joints alone."""
     return "skin" not in node and not matrix[:3, :3].any()
 
@@ -151,7 +173,7 @@ def _piece(
     node: int,
     number: int,
     globals_: Matrices,
-    pictures: dict[int, NDArray[np.uint8]],
+    base_colors: BaseColors,
 ) -> Piece:
     tree = reader.tree
     item = tree["nodes"][node]
@@ -165,11 +187,8 @@ def _piece(
     if len(matrices) > 1 and flattening(matrices).any():
         raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
     faces = _faces(reader, primitive, count)
-    material = tree["materials"][primitive["material"]] if "material" in primitive else {}
-    shading = _base_color(material)
-    texture, uvs = _texture(reader, shading.get("baseColorTexture"), attributes, pictures)
-    colors = read_accessor(reader, attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
-    factor = [float(value) for value in shading.get("baseColorFactor", (1, 1, 1, 1))]
+    shading = base_colors.read(primitive)
+    uvs, colors = shading.uvs, shading.colors
     if any(values is not None and len(values) != count for values in (uvs, colors)):
         raise BadInput("the attributes of a mesh of the model have different lengths; export it again")
     with np.errstate(all="ignore"):
@@ -180,10 +199,11 @@ def _piece(
         vertices,
         np.where(mirrored[faces[:, :1]], faces[:, ::-1], faces),
         uvs,
-        texture,
-        (factor[0], factor[1], factor[2]),
-        None if colors is None else colors.astype(np.float64),
-        masked=material.get("alphaMode", "OPAQUE") != "OPAQUE",
+        shading.texture,
+        shading.factor,
+        colors,
+        shading.masked,
+        shading.wrap,
     )
     return Piece(node, number, local.astype(np.float32), matrices, faces, morphed, part)
 
@@ -220,47 +240,3 @@ def _faces(reader: GlbReader, primitive: dict[str, Any], count: int) -> NDArray[
             return strip
         case _:
             return np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], 1)
-
-
-def _base_color(material: dict[str, Any]) -> dict[str, Any]:
-    """Return the shading of a material by metal and roughness, or what equals its base color in an older one."""
-    specular = json_object(json_object(material.get("extensions")).get(SPECULAR))
-    if "pbrMetallicRoughness" in material or not specular:
-        return json_object(material.get("pbrMetallicRoughness"))
-    renamed = {"diffuseFactor": "baseColorFactor", "diffuseTexture": "baseColorTexture"}
-    return {renamed[key]: value for key, value in specular.items() if key in renamed}
-
-
-def _texture(
-    reader: GlbReader, info: Any, attributes: dict[str, int], pictures: dict[int, NDArray[np.uint8]]
-) -> tuple[NDArray[np.uint8] | None, NDArray[np.float64] | None]:
-    """Return the base color texture and its coordinates; both None without one."""
-    if not isinstance(info, dict):
-        return None, None
-    tree = reader.tree
-    texture = tree["textures"][info["index"]]
-    extensions = json_object(texture.get("extensions"))
-    source = next(
-        (v["source"] for v in (json_object(extensions.get("EXT_texture_webp")), texture) if "source" in v), None
-    )
-    transform = json_object(json_object(info.get("extensions")).get("KHR_texture_transform"))
-    name = f"TEXCOORD_{transform.get('texCoord', info.get('texCoord', 0))}"
-    if source is None or name not in attributes:
-        return None, None
-    if source not in pictures:
-        pictures[source] = _picture(reader, source)
-    uvs = read_accessor(reader, attributes[name]).astype(np.float64)
-    turn = float(transform.get("rotation", 0))
-    c, s = math.cos(turn), math.sin(turn)
-    uvs = (uvs * transform.get("scale", (1, 1))) @ np.array([[c, -s], [s, c]]) + transform.get("offset", (0, 0))
-    return pictures[source], uvs
-
-
-def _picture(reader: GlbReader, index: int) -> NDArray[np.uint8]:
-    image = reader.tree["images"][index]
-    if "bufferView" not in image:
-        raise BadInput(
-            f"the texture {str(image.get('uri', index))[:80]!r} of the model is missing; put it beside the model, or "
-            "export the model as GLB with its textures"
-        )
-    return decode_picture(reader.view(image["bufferView"]), str(image.get("name", index)))

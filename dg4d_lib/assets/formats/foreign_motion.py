@@ -1,8 +1,8 @@
 """GLBs of other programs in motion: the same file with morph targets over time, and its skeleton animated.
 
 Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. A skeleton moves,
-and morph targets do what it cannot. Existing animations are dropped, since they would move the model twice; existing
-morph targets keep their default weights.
+and morph targets do what it cannot. Existing animations are dropped, since they would move the model twice, and scenes
+that are not shown, since their nodes may be shared; existing morph targets keep their default weights.
 """
 
 import json
@@ -76,6 +76,8 @@ def write_moving_glb(
     tree = document.tree
     if tree.pop("animations", None):
         notes.append("the animations of the model were dropped: the new motion takes their place")
+    if len(tree["scenes"]) > 1:
+        notes.append("the scenes of the model that are not shown were dropped")
     step = -(-len(moved) // MAX_POSES)
     if step > 1:
         notes.append(f"the animated model has a key every {step} frames; {MAX_POSES} morph targets are allowed")
@@ -206,22 +208,26 @@ def _targets(
     rest = normals_of(piece.local) if normals_of else None
     targets = []
     for frame, state, inverse in poses:
-        local = transform_points(inverse, state).astype(np.float32)
+        local = transform_points(inverse, state)
         name = f"{piece.part.name} frame_{frame:03d}"
-        target = {"POSITION": document.add_accessor(name, local - piece.local, VERTEX_DATA)}
+        shifts = (local - piece.local).astype(np.float32)  # of a small difference: a mesh may be far from its origin
+        target = {"POSITION": document.add_accessor(name, shifts, VERTEX_DATA)}
         if normals_of is not None and rest is not None:
-            target["NORMAL"] = document.add_accessor(f"{name} normals", normals_of(local) - rest, VERTEX_DATA)
+            turned = normals_of(local.astype(np.float32))
+            target["NORMAL"] = document.add_accessor(f"{name} normals", turned - rest, VERTEX_DATA)
         targets.append(target)
     return targets
 
 
 def _place(document: GltfDocument, placement: NDArray[np.float64]) -> None:
-    """Put the root nodes of the scene under a node that moves them into the world.
+    """Put the root nodes of the scene under a node that moves them into the world; other scenes are dropped.
 
-    Skinned meshes stay roots, as glTF advises: they follow their joints alone.
+    Skinned meshes stay roots, as glTF advises: they follow their joints alone. A node may be a root in another scene,
+    but not below another node at the same time.
     """
     tree = document.tree
     scene = tree["scenes"][tree.get("scene", 0)]
+    tree["scenes"], tree["scene"] = [scene], 0
     skinned = [node for node in scene["nodes"] if _follows_joints_alone(tree, node)]
     others = [node for node in scene["nodes"] if node not in skinned]
     root = document.add("nodes", name=PLACEMENT, children=others, matrix=placement.T.ravel().tolist())

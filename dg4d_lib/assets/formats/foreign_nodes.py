@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dg4d_lib.assets.formats.gltf import GlbReader, read_accessor
+from dg4d_lib.assets.formats.gltf import GlbReader, json_object, read_accessor
 from dg4d_lib.errors import BadInput
 
 MAX_NODES = 100_000
@@ -45,6 +45,27 @@ def global_matrices(tree: dict[str, Any], unscaled: Container[int] = ()) -> Matr
         found[index] = parent @ _local_matrix(node)
         waiting += [(child, found[index], depth + 1) for child in nodes[index].get("children", ())]
     return found
+
+
+def invisible_nodes(tree: dict[str, Any], nodes: Iterable[int]) -> set[int]:
+    """Return the nodes that KHR_node_visibility hides, with all below them; parents come before their children."""
+    found: set[int] = set()
+    for node in nodes:
+        item = tree["nodes"][node]
+        visibility = json_object(json_object(item.get("extensions")).get("KHR_node_visibility"))
+        if node in found or visibility.get("visible", True) is False:
+            found |= {node, *item.get("children", ())}
+    return found
+
+
+def move_roots(tree: dict[str, Any], shift: NDArray[np.float64]) -> None:
+    """Move all that the scene shows, by its root nodes."""
+    for index in tree["scenes"][tree.get("scene", 0)]["nodes"]:
+        node = tree["nodes"][index]
+        if "matrix" in node:
+            node["matrix"] = [*node["matrix"][:12], *(np.array(node["matrix"][12:15]) + shift).tolist(), 1.0]
+        else:
+            node["translation"] = (np.array(node.get("translation", (0.0, 0.0, 0.0))) + shift).tolist()
 
 
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:

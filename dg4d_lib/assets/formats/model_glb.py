@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GltfDocument
-from dg4d_lib.mesh.models.model import Model
+from dg4d_lib.mesh.models.model import REPEATED, Model, ModelPart, Wraps
 
 
 def write_model_glb(model: Model) -> bytes:
     """Encode a model at rest; textures as PNG, each stored once."""
     document = GltfDocument({})
-    textures: dict[int, int] = {}
+    textures = _Textures(document)
     nodes = []
     for part in model.parts:
         attributes = {"POSITION": document.add_accessor(part.name, part.vertices.astype("<f4"), VERTEX_DATA)}
@@ -25,9 +25,7 @@ def write_model_glb(model: Model) -> bytes:
             uvs = document.add_accessor(f"{part.name} uvs", _numbers(part.uvs), VERTEX_DATA)
             attributes["TEXCOORD_0"] = uvs
         if part.texture is not None and part.uvs is not None:
-            if id(part.texture) not in textures:
-                textures[id(part.texture)] = _add_texture(document, part.name, part.texture)
-            shading["baseColorTexture"] = {"index": textures[id(part.texture)]}
+            shading["baseColorTexture"] = {"index": textures.add(part, part.texture)}
         if part.colors is not None:
             colors = document.add_accessor(f"{part.name} colors", _colors(part.colors), VERTEX_DATA)
             attributes["COLOR_0"] = colors
@@ -54,10 +52,26 @@ def _colors(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return _numbers(values).clip(0, 1)
 
 
-def _add_texture(document: GltfDocument, name: str, pixels: NDArray[np.uint8]) -> int:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    image = document.add(
-        "images", name=name, mimeType="image/png", bufferView=document.add_view(name, buffer.getvalue())
-    )
-    return document.add("textures", name=name, source=image)
+class _Textures:
+    """Textures of a document: pictures, samplers and their pairs, each stored once."""
+
+    def __init__(self, document: GltfDocument) -> None:
+        self.document = document
+        self.images: dict[int, int] = {}
+        self.samplers: dict[Wraps, int] = {}
+        self.pairs: dict[tuple[int, int | None], int] = {}
+
+    def add(self, part: ModelPart, pixels: NDArray[np.uint8]) -> int:
+        """Return the number of the texture of a part."""
+        if id(pixels) not in self.images:
+            buffer = io.BytesIO()
+            Image.fromarray(pixels).save(buffer, "PNG")
+            view = self.document.add_view(part.name, buffer.getvalue())
+            self.images[id(pixels)] = self.document.add("images", name=part.name, mimeType="image/png", bufferView=view)
+        if part.wrap != REPEATED and part.wrap not in self.samplers:
+            along_u, along_v = map(int, part.wrap)
+            self.samplers[part.wrap] = self.document.add("samplers", wrapS=along_u, wrapT=along_v)
+        pair = self.images[id(pixels)], self.samplers.get(part.wrap)
+        if pair not in self.pairs:
+            self.pairs[pair] = self.document.add("textures", name=part.name, source=pair[0], sampler=pair[1])
+        return self.pairs[pair]

@@ -31,6 +31,14 @@ def decode_picture(content: bytes, name: str) -> NDArray[np.uint8]:
                     f"the texture {name!r} of the model is {picture.width} x {picture.height} pixels; at most "
                     f"{MAX_IMAGE_PIXELS} pixels are read: make it smaller"
                 )
-            return np.array(picture.convert("RGBA"))
+            return np.array(_in_8_bits(picture).convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise BadInput(f"the texture {name!r} of the model cannot be read ({error}); save it as PNG or JPEG") from error
+
+
+def _in_8_bits(picture: Image.Image) -> Image.Image:
+    """Return a picture with gray of 16 bits in 8 bits; Pillow would clip it at 255."""
+    if not picture.mode.startswith("I"):
+        return picture
+    levels = np.array(picture).astype(np.uint32)
+    return Image.fromarray(((levels + 128) // 257).astype(np.uint8))

@@ -1,31 +1,40 @@
-"""OBJ reader: a part per object and material, polygons as fans of triangles, textures of the MTL files beside it."""
+"""OBJ reader: a part per object and material, polygons as triangles, textures of the MTL files beside it."""
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dg4d_lib.assets.formats.mtl import Material, library_names, read_mtl
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart, to_linear
+from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision, to_linear
+from dg4d_lib.mesh.models.polygons import triangulate
 
 Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 _CONTINUED = re.compile(r"\\\r?\n")  # a backslash at the end of a line
 FLOAT_COLORS = 2.0  # largest color of a file with floats, which may exceed 1 a little; others have colors of 0 to 255
+MOST_NAMED = 5  # materials in a note
 _NAMING = ("o", "g", "usemtl", "mtllib")  # statements of names, where "#" begins no comment
 
 
 @dataclass
 class _Group:
-    """Corners of the triangles of one object and material: indices of positions and texture coordinates, or -1."""
+    """Polygons of one object and material.
+
+    Attributes:
+        name: of the object.
+        material: its name.
+        corners: of one polygon after the other: indices of a position and of texture coordinates, or -1.
+        counts: number of corners of every polygon.
+    """
 
     name: str
     material: str
     corners: list[tuple[int, int]] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
 
 
 def read_obj(text: str, read: Read, decode: Decode, max_faces: int) -> Model:
@@ -66,6 +75,7 @@ class _Content:
         self.colors: list[tuple[float, ...]] = []  # of the positions; empty where a line has none
         self.uvs: list[tuple[float, float]] = []
         self.materials: dict[str, Material] = {}
+        self.absent: list[str] = []  # MTL files that are missing
         self.groups: dict[tuple[str, str], _Group] = {}
         self.name, self.material, self.faces = "model", "", 0
 
@@ -83,19 +93,27 @@ class _Content:
             case ["usemtl"]:
                 self.material = " ".join(words[1:])
             case ["mtllib"]:
-                for name in library_names(" ".join(words[1:])):
-                    content = self.read(name)  # without it materials are gray, as in players
-                    self.materials |= read_mtl((content or b"").decode("utf-8", "replace"))
+                self.add_library(" ".join(words[1:]))
             case ["f"]:
                 self.add_face([_corner(word, len(self.positions), len(self.uvs)) for word in words[1:]])
 
+    def add_library(self, statement: str) -> None:
+        """Read the MTL files that a statement names; without them materials are gray, as in players."""
+        found = {name: content for name in library_names(statement) if (content := self.read(name)) is not None}
+        for content in found.values():
+            self.materials |= read_mtl(content.decode("utf-8-sig", "replace"))
+        if not found:
+            self.absent.append(statement)
+
     def add_face(self, corners: list[tuple[int, int]]) -> None:
-        """Add a polygon as a fan of triangles."""
+        """Add a polygon; those of less than three corners are left out."""
+        if len(corners) < 3:
+            return
         key = self.name, self.material
         group = self.groups.setdefault(key, _Group(*key))
-        for second, third in pairwise(corners[1:]):
-            group.corners += [corners[0], second, third]
-        self.faces += max(0, len(corners) - 2)
+        group.corners += corners
+        group.counts.append(len(corners))
+        self.faces += len(corners) - 2
         if self.faces > self.max_faces:
             raise BadInput(
                 f"the model has more than {self.max_faces} triangles, the limit asset.max_faces: simplify it, or raise "
@@ -104,10 +122,7 @@ class _Content:
 
     def model(self, decode: Decode) -> Model:
         """Return the parts."""
-        with np.errstate(over="ignore"):
-            points = np.array(self.positions, np.float64).astype(np.float32).reshape(-1, 3)
-        if not np.isfinite(points).all():
-            raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
+        points = np.array(self.positions, np.float64).reshape(-1, 3)
         colored = np.array(self.colors, float) if all(len(row) == 3 for row in self.colors) else None
         if colored is not None and not np.isfinite(colored).all():
             colored = None
@@ -118,11 +133,25 @@ class _Content:
         pictures: dict[str, NDArray[np.uint8]] = {}
         parts = []
         for group in self.groups.values():
-            if group.corners:
-                known = self.materials.get(group.material, unknown)
-                texture = read_texture(known.textures, self.read, decode, pictures)
-                parts.append(_part(group, points, coordinates, colored, known, texture))
-        return Model(tuple(parts))
+            known = self.materials.get(group.material, unknown)
+            texture = read_texture(known.textures, self.read, decode, pictures)
+            parts.append(_part(group, points, coordinates, colored, known, texture))
+        return single_precision(parts, self.notes())
+
+    def notes(self) -> list[str]:
+        """Return a sentence about materials that are missing."""
+        named = {group.material for group in self.groups.values()} - {""}
+        missing = sorted(named - set(self.materials))
+        if not missing:
+            return []
+        files = f"; MTL files that are missing beside the model: {', '.join(self.absent)}" if self.absent else ""
+        return [f"no color was found for the materials {_listed(missing)}{files}"]
+
+
+def _listed(names: list[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(repr(name[:80]) for name in names[:MOST_NAMED]) + more
 
 
 def _corner(word: str, positions: int, uvs: int) -> tuple[int, int]:
@@ -161,19 +190,21 @@ def read_texture(
 
 def _part(
     group: _Group,
-    points: NDArray[np.float32],
+    points: NDArray[np.float64],
     uvs: NDArray[np.float64],
     colors: NDArray[np.float64] | None,
     material: Material,
     texture: NDArray[np.uint8] | None,
 ) -> ModelPart:
-    pairs, faces = np.unique(np.array(group.corners), axis=0, return_inverse=True)
+    corners = np.array(group.corners)
+    pairs, index = np.unique(corners, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[triangulate(points, corners[:, 0], np.array(group.counts))]
     textured = bool((pairs[:, 1] >= 0).any())
     factor = (1.0, 1.0, 1.0) if texture is not None else tuple(map(float, to_linear(np.array(material.color))))
     return ModelPart(
         f"{group.name} {group.material}".strip(),
         points[pairs[:, 0]],
-        faces.reshape(-1, 3),
+        faces,
         uvs[pairs[:, 1]] if textured else None,
         texture if textured else None,
         (factor[0], factor[1], factor[2]),

@@ -5,21 +5,22 @@ that a small file cannot grow.
 """
 
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Ar, Gf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol
+from pxr import Gf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol
 
+from dg4d_lib.assets.formats.usd_colors import WHITE, Decode, UsdColor, UsdMaterials
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart
+from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision
+from dg4d_lib.mesh.models.polygons import triangulate
 
 MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
 GRAY = (0.5, 0.5, 0.5)  # of a material without a readable color, linear
-WHITE = (1.0, 1.0, 1.0)
-Decode = Callable[[bytes, str], NDArray[np.uint8]]
+MOST_NAMED = 5  # objects in a note
 
 
 def check_usdz(path: Path) -> None:
@@ -74,7 +75,8 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         upright = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     parts: list[ModelPart] = []
-    faces, pictures = 0, _Pictures(package, decode)
+    others: list[str] = []  # visible objects that are no meshes
+    faces, materials = 0, UsdMaterials(package, decode)
     for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
         if number >= MAX_PRIMS:
             raise BadInput(f"the USD file has more than {MAX_PRIMS} objects; simplify it")
@@ -86,8 +88,10 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
                 "without instancing"
             )
         if not prim.IsA(UsdGeom.Mesh):
+            if prim.IsA(UsdGeom.Gprim):
+                others.append(f"{prim.GetTypeName()} {prim.GetName()[:80]!r}")
             continue
-        found = list(_parts(UsdGeom.Mesh(prim), time, cache, upright, pictures))
+        found = list(_parts(UsdGeom.Mesh(prim), time, cache, upright, materials))
         parts += found
         faces += sum(len(part.faces) for part in found)
         if faces > max_faces:
@@ -97,9 +101,15 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
             )
     if not parts:
         raise BadInput(_no_mesh(stage))
-    if not all(np.isfinite(part.vertices).all() for part in parts):
-        raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
-    return Model(tuple(parts))
+    return single_precision(parts, (*dict.fromkeys(materials.notes), *_left_out(others)))
+
+
+def _left_out(objects: list[str]) -> list[str]:
+    """Return a note about objects that are no meshes."""
+    if not objects:
+        return []
+    more = f" and {len(objects) - MOST_NAMED} more" if len(objects) > MOST_NAMED else ""
+    return [f"objects of the USD file that are no meshes were left out: {', '.join(objects[:MOST_NAMED])}{more}"]
 
 
 def _no_mesh(stage: Usd.Stage) -> str:
@@ -119,7 +129,7 @@ def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:
 
 
 def _parts(
-    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], pictures: "_Pictures"
+    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], materials: UsdMaterials
 ) -> Iterator[ModelPart]:
     """Return a part for every material of a mesh."""
     prim = mesh.GetPrim()
@@ -130,38 +140,43 @@ def _parts(
         return
     if counts.min() < 0 or counts.sum() != len(indices) or indices.min() < 0 or indices.max() >= len(points):
         raise BadInput("the faces of a mesh in the USD file do not fit its points; export it again")
-    corners = _fans(counts)  # three positions in `indices` per triangle
+    corners = triangulate(points, indices, counts)
     names = [primvar.GetPrimvarName() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars() if _is_uv(primvar)]
-    uvs = _per_corner(prim, ("st", "UVMap", "st0", *names), indices, counts, time)
     colors = _per_corner(prim, ("displayColor",), indices, counts, time)
     matrix = np.array(cache.GetLocalToWorldTransform(prim))  # row vectors
     mirrored = np.linalg.det(matrix[:3, :3]) < 0
     if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
-    placed = ((points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T).astype(np.float32)
+    placed = (points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T
     polygons = np.repeat(np.arange(len(counts)), (counts - 2).clip(0))  # of the triangles
     for owner, chosen in _faces_by_material(mesh, len(counts), time):
         triangles = corners[chosen[polygons]]
         if not len(triangles):
             continue
-        color = _material(owner, pictures)
+        color = materials.read(owner)
+        if color is not None and color.is_hidden:
+            continue
         shown = colors if color is None else None
+        uvs = None
         if color is None:
-            color = None, GRAY if shown is None else WHITE
-        elif color[0] is not None and uvs is None:
-            color = None, GRAY
-        texture, factor = color
-        coordinates = None if texture is None else uvs
-        rows = [indices[:, None].astype(float), *(values for values in (coordinates, shown) if values is not None)]
+            color = UsdColor(GRAY if shown is None else WHITE)
+            if shown is None:
+                materials.note_gray(owner)
+        elif color.texture is not None:
+            uvs = _per_corner(prim, (color.primvar, "st", "UVMap", "st0", *names), indices, counts, time)
+            color = UsdColor(GRAY) if uvs is None else color
+        rows = [indices[:, None].astype(float), *(values for values in (uvs, shown) if values is not None)]
         unique, faces = np.unique(np.concatenate(rows, 1)[triangles.ravel()], axis=0, return_inverse=True)
         yield ModelPart(
             prim.GetName() if owner == prim else f"{prim.GetName()} {owner.GetName()}",
             placed[unique[:, 0].astype(np.int64)],
             faces.reshape(-1, 3),
-            None if coordinates is None else np.stack([unique[:, 1], 1 - unique[:, 2]], 1),
-            texture,
-            factor,
+            None if uvs is None else color.place(unique[:, 1:3]),
+            color.texture,
+            color.factor,
             None if shown is None else unique[:, 1:],
+            color.masked,
+            color.wrap,
         )
 
 
@@ -181,20 +196,12 @@ def _is_uv(primvar: Any) -> bool:
     return str(primvar.GetTypeName()) in ("texCoord2f[]", "texCoord2d[]", "texCoord2h[]", "float2[]")
 
 
-def _fans(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the corners of the triangles that polygons with these numbers of corners are split into."""
-    triangles = (counts - 2).clip(0)
-    starts = np.repeat(np.cumsum(counts) - counts, triangles)
-    number = np.arange(len(starts)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([starts, starts + number + 1, starts + number + 2], 1)
-
-
 def _per_corner(
     prim: Any, names: tuple[str, ...], indices: NDArray[np.int64], counts: NDArray[np.int64], time: Any
 ) -> NDArray[np.float64] | None:
     """Return the values of the first existing primvar at every corner; None if it cannot be used."""
     api = UsdGeom.PrimvarsAPI(prim)
-    for name in names:
+    for name in filter(None, names):
         primvar = api.GetPrimvar(name)
         if not primvar or not primvar.HasValue():
             continue
@@ -210,50 +217,3 @@ def _per_corner(
             case UsdGeom.Tokens.constant if len(values):
                 return np.repeat(values[:1], len(indices), 0)
     return None
-
-
-def _material(prim: Any, pictures: "_Pictures") -> tuple[NDArray[np.uint8] | None, tuple[float, float, float]] | None:
-    """Return the base color texture and the linear factor of a prim's material; None if it has no color."""
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    shader = material.ComputeSurfaceSource()[0] if material else None
-    source = _source(shader, "diffuseColor") if shader else None
-    if source is None:
-        return None
-    if UsdShade.Utils.GetType(source.GetName()) == UsdShade.AttributeType.Input:
-        value = source.Get()
-        return None if value is None else (None, _rgb(value))
-    texture = UsdShade.Shader(source.GetPrim())
-    picture, scale = (found and found.Get() for found in (_source(texture, "file"), _source(texture, "scale")))
-    if picture is None:
-        return None
-    return pictures.read(picture), WHITE if scale is None else _rgb(scale)  # the scale is of linear values
-
-
-def _source(shader: UsdShade.Shader, name: str) -> Any:
-    """Return the attribute that an input gets its value from: itself, an input of a material, or an output."""
-    found = shader.GetInput(name)
-    attributes = found.GetValueProducingAttributes() if found else ()
-    return attributes[0] if attributes else None
-
-
-def _rgb(value: Any) -> tuple[float, float, float]:
-    return float(value[0]), float(value[1]), float(value[2])
-
-
-class _Pictures:
-    """Textures in a package, each decoded once."""
-
-    def __init__(self, package: str, decode: Decode) -> None:
-        self.package, self.decode = package, decode
-        self.decoded: dict[str, NDArray[np.uint8]] = {}
-
-    def read(self, picture: Any) -> NDArray[np.uint8]:
-        """Return a texture by its asset path."""
-        path = picture.resolvedPath
-        if path not in self.decoded:
-            inside = path.startswith(f"{self.package}[")
-            asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)) if inside else None
-            if asset is None:
-                raise BadInput(f"the texture {picture.path[:80]!r} of the model is missing; pack it into the USDZ")
-            self.decoded[path] = self.decode(bytes(asset.GetBuffer()), picture.path)
-        return self.decoded[path]

@@ -1,11 +1,41 @@
 """Models of users: triangle meshes in parts, each with its material's base color."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from dg4d_lib.errors import BadInput
+
 OPAQUE = 128  # alpha of a texel, of 255, from which a masked material is opaque
+TRANSPARENT = "the materials of the model are transparent everywhere; give it an opaque one"
+FAR = 100  # distance from the origin, in sizes of a model, from which float32 rounds it by more than 1e-5 of its size
+
+
+class Wrap(IntEnum):
+    """Wrap mode of a texture along one axis, by its number in glTF."""
+
+    REPEAT = 10497
+    MIRROR = 33648
+    CLAMP = 33071
+
+    @property
+    def period(self) -> int:
+        """Length after which the texture repeats, in texture coordinates; 0 if it does not."""
+        return {Wrap.REPEAT: 1, Wrap.MIRROR: 2, Wrap.CLAMP: 0}[self]
+
+    def texels(self, numbers: Int[np.ndarray, "*n"], size: int) -> Int[np.ndarray, "*n"]:
+        """Return the texels in [0, size) that are seen at any number of texels from the border."""
+        if self is Wrap.CLAMP:
+            return numbers.clip(0, size - 1)
+        inside = numbers % (self.period * size)
+        return np.minimum(inside, 2 * size - 1 - inside)  # the second one is smaller only in a mirror image
+
+
+Wraps = tuple[Wrap, Wrap]  # along u and along v
+REPEATED: Wraps = (Wrap.REPEAT, Wrap.REPEAT)
 
 
 @dataclass(frozen=True)
@@ -16,11 +46,12 @@ class ModelPart:
         name: of the part.
         vertices: at rest, in the coordinates of the model.
         faces: indices into the vertices.
-        uvs: texture coordinates, u right and v down, repeated outside [0, 1]; None without texture.
+        uvs: texture coordinates, u right and v down; None without texture.
         texture: base color in sRGB, and alpha.
         factor: linear color that multiplies texture and vertex colors.
         colors: linear color per vertex; None for white.
         masked: True if the alpha of the texture cuts holes.
+        wrap: wrap modes of the texture outside [0, 1].
     """
 
     name: str
@@ -31,6 +62,7 @@ class ModelPart:
     factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
     colors: Float[np.ndarray, "v 3"] | None = None
     masked: bool = False
+    wrap: Wraps = REPEATED
 
     def sample(
         self, faces: Int[np.ndarray, " n"], barycentrics: Float[np.ndarray, "n 3"]
@@ -42,7 +74,8 @@ class ModelPart:
         if self.colors is not None:
             linear = linear * np.einsum("nk,nkc->nc", barycentrics, self.colors[corners])
         if self.texture is not None and self.uvs is not None:
-            texels = sample_bilinear(self.texture, np.einsum("nk,nkc->nc", barycentrics, self.uvs[corners]))
+            uvs = np.einsum("nk,nkc->nc", barycentrics, self.uvs[corners])
+            texels = sample_bilinear(self.texture, uvs, self.wrap)
             linear = linear * to_linear(texels[:, :3] / 255)
             alpha = texels[:, 3] if self.masked else alpha
         return to_srgb(linear).astype(np.float32), alpha.round().astype(np.int64)
@@ -54,9 +87,11 @@ class Model:
 
     Attributes:
         parts: meshes; at least one with triangles.
+        notes: sentences about what is not used or was changed.
     """
 
     parts: tuple[ModelPart, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def vertices(self) -> Float[np.ndarray, "v 3"]:
@@ -83,25 +118,67 @@ class Model:
 
     def placed(self, matrix: Float[np.ndarray, "4 4"]) -> "Model":
         """Return the model with an affine transform of its vertices."""
-        return Model(
-            tuple(
+        return replace(
+            self,
+            parts=tuple(
                 replace(part, vertices=(part.vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32))
                 for part in self.parts
-            )
+            ),
         )
 
 
-def sample_bilinear(texture: UInt8[np.ndarray, "h w c"], uvs: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
-    """Sample a texture that repeats, bilinearly; values as in the texture."""
+def single_precision(parts: Sequence[ModelPart], notes: Sequence[str] = ()) -> Model:
+    """Return the model of parts, with vertices in float32; one that is far from the origin is moved there first.
+
+    Args:
+        parts: as in the file, in float64.
+        notes: sentences about the file; one about the move is added.
+
+    Raises:
+        BadInput: vertices are not finite numbers, in float32.
+    """
+    center = far_center(np.concatenate([part.vertices for part in parts]))
+    with np.errstate(over="ignore"):
+        placed = [replace(part, vertices=(part.vertices - center).astype(np.float32)) for part in parts]
+    if not all(np.isfinite(part.vertices).all() for part in placed):
+        raise BadInput("the model has vertices that are not finite numbers (NaN or infinity); export it again")
+    return Model(tuple(placed), (*notes, *([moved_note(center)] if center.any() else [])))
+
+
+def far_center(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " 3"]:
+    """Return the center of a model that is far from the origin; 0 for others."""
+    with np.errstate(all="ignore"):  # numbers that are not finite are refused elsewhere
+        low, high = vertices.min(0).astype(np.float64), vertices.max(0).astype(np.float64)
+        size, distance = np.abs(high - low).max(), max(np.abs(low).max(), np.abs(high).max())
+    is_far = np.isfinite(distance) and distance > FAR * size
+    return low / 2 + high / 2 if is_far else np.zeros(3)
+
+
+def moved_note(center: Float[np.ndarray, " 3"]) -> str:
+    """Return a note about a model that was moved from a far center to the origin."""
+    place = ", ".join(f"{value:.6g}" for value in center)
+    return f"the model is far from the origin; it was moved by minus ({place}), to keep its shape in single precision"
+
+
+def sample_bilinear(
+    texture: UInt8[np.ndarray, "h w c"], uvs: Float[np.ndarray, "n 2"], wrap: Wraps = REPEATED
+) -> Float[np.ndarray, "n c"]:
+    """Sample a texture bilinearly; values as in the texture."""
     height, width = texture.shape[:2]
-    x, y = (uvs[:, 0] % 1) * width - 0.5, (uvs[:, 1] % 1) * height - 0.5
+    u, v = (_folded(uvs[:, axis], mode) for axis, mode in enumerate(wrap))
+    x, y = u * width - 0.5, v * height - 0.5
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     fx, fy = (x - left)[:, None], (y - top)[:, None]
     total = np.zeros((len(uvs), texture.shape[2]))
     for row, wy in ((top, 1 - fy), (top + 1, fy)):
         for column, wx in ((left, 1 - fx), (left + 1, fx)):
-            total += wy * wx * texture[row % height, column % width]
+            total += wy * wx * texture[wrap[1].texels(row, height), wrap[0].texels(column, width)]
     return total
+
+
+def _folded(coordinates: Float[np.ndarray, " n"], mode: Wrap) -> Float[np.ndarray, " n"]:
+    """Return texture coordinates of the same texels in the first period."""
+    return coordinates % mode.period if mode.period else coordinates.clip(0, 1)
 
 
 def to_linear(srgb: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -14,7 +14,7 @@ from dg4d_lib.gaussians.transform import transform
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.extraction.topology import group_vertices
-from dg4d_lib.mesh.models.model import OPAQUE, Model
+from dg4d_lib.mesh.models.model import OPAQUE, TRANSPARENT, Model
 from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
 
 WELD = 1e-5  # of the model's size: vertices closer than this are one
@@ -79,7 +79,7 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
     colors, alpha = model.sample(fine.sources[chosen], places)
     kept = alpha >= OPAQUE
     if not kept.any():
-        raise BadInput("the materials of the model are transparent everywhere; give it an opaque one")
+        raise BadInput(TRANSPARENT)
     chosen, weights, colors = chosen[kept], weights[kept], colors[kept]
     means = np.einsum("nk,nkc->nc", weights, corners[chosen])
     scale = SPREAD * math.sqrt(0.5 * ends[-1] / count)

@@ -19,6 +19,7 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb, write_frames_glb, write_glb, write_mesh_glb
 from dg4d_lib.assets.formats.gltf import GlbReader, GltfDocument
 from dg4d_lib.errors import BadInput
+from dg4d_lib.input_settings import WarpSettings
 from dg4d_lib.mesh.textured import TexturedMesh
 
 FRAMES, FPS = 5, 7.0
@@ -65,6 +66,12 @@ WRITTEN = {
     "per frame": lambda: write_frames_glb([ball(0), ball(1), ball(0)], FPS),
     "still": lambda: write_mesh_glb(ball(), PNG),
 }
+
+
+def test_the_smallest_frame_rate_of_a_driving_video_has_finite_times() -> None:
+    slowest = WarpSettings.model_json_schema()["properties"]["fps"]["minimum"]
+    for settings in (PNG, GltfSettings()):
+        assert read_glb(write_glb(moving_ball(frames=128, fps=slowest), settings)).fps == pytest.approx(slowest)
 
 
 @pytest.mark.parametrize("kind", WRITTEN)

@@ -59,6 +59,15 @@ def test_an_obj_comes_with_all_of_its_materials(tmp_path: Path, store: ArtifactS
     assert entries(tmp_path / "x.obj", store) == ["model.obj", "a.mtl", "b.mtl"]
 
 
+def test_a_byte_order_mark_hides_no_file(tmp_path: Path, store: ArtifactStore) -> None:
+    (tmp_path / "x.obj").write_text("mtllib a.mtl\nv 0 0 0\n", "utf-8-sig")
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd paint.png\n", "utf-8-sig")
+    (tmp_path / "paint.png").write_bytes(b"1")
+    (tmp_path / "y.gltf").write_text(json.dumps({"images": [{"uri": "paint.png"}]}), "utf-8-sig")
+    assert entries(tmp_path / "x.obj", store) == ["model.obj", "a.mtl", "paint.png"]
+    assert entries(tmp_path / "y.gltf", store) == ["model.gltf", "paint.png"]
+
+
 def test_a_ply_comes_with_its_texture(tmp_path: Path, store: ArtifactStore) -> None:
     (tmp_path / "x.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile my paint.png\nend_header\n")
     (tmp_path / "my paint.png").write_bytes(b"1")
