@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from dg4d.asset import Asset, load
 from dg4d.progress import OnProgress, reporting
 from dg4d_lib.errors import BadInput, DG4DError
-from flows import home
+from flows.convert import connect, convert_job, stored
 from flows.engine.output_lock import is_up_to_date
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
 from flows.inputs.given_views import ViewFile, ViewsRequest
@@ -110,6 +110,10 @@ def make(
         BackendUnavailable: a library, a device or weights are missing.
         StepError: a step failed; the output folder is as it was.
     """
+    if views is not None and not isinstance(views, Mapping):
+        raise BadInput(
+            'views is a dict of azimuth to file, for example {90: "right.png"}; given ' + type(views).__name__
+        )
     with _as_file(picture) as path:
         request = _request(
             item=name or _name_of(picture, asset, video, text),
@@ -222,23 +226,21 @@ def _convert(
         raise BadInput(f"unknown engine {engine!r}; choose one of: {', '.join(ENGINES)}")
     request.check()
     check_folder(folder, request.item, force)
-    job = request.to_job(home.store())
-    if not is_up_to_date(folder, job.digest()):
-        with reporting(job, on_progress):
-            _run(job, folder, engine)
+    with stored(request) as job:
+        if not is_up_to_date(folder, job.digest()):
+            with reporting(job, on_progress):
+                _run(job, folder, engine, force)
     return load(folder)
 
 
-def _run(job: ConversionJob, folder: Path, engine: Engine) -> None:
+def _run(job: ConversionJob, folder: Path, engine: Engine, force: bool) -> None:
     if engine == "inline":
         from flows.inline import convert_inline
 
-        convert_inline(job, folder)
+        convert_inline(job, folder, force)
     else:
-        from flows.convert import connect, convert_job
-
         connect()
-        convert_job(job, folder)
+        convert_job(job, folder, force=force)
 
 
 def _each(convert: Any, items: list[Item], workers: int) -> list[Asset | Exception]:

@@ -1,5 +1,6 @@
 """Flows that convert many jobs, a few at a time; a failed one does not stop the others."""
 
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from prefect.task_runners import TaskRunner
 from flows import home
 from flows.catalog_request import CatalogRequest, ready
 from flows.convert import convert_job, save_pictures
+from flows.engine import leases
 from flows.engine.executors import stop_all
 from flows.engine.item_runs import failure, item_deployment
 from flows.engine.orphans import claim_run
@@ -27,6 +29,7 @@ from flows.inputs.manifest import Item
 from flows.inputs.places import parse_where
 from flows.packages.delivery import remove_expired
 from flows.packages.summary import BatchProgress, Row, with_verdict
+from flows.processes import repeated
 from flows.ui.gallery import Gallery
 from steps.contract import ArtifactRef
 
@@ -108,8 +111,9 @@ def convert_all(
     gallery = Gallery(title, progress, out)
     with item_runner(place, workers) as runner:
         try:
-            for attempt in (1, 2):
-                todo = list(_attempt(attempt, todo, out, workers, progress, strict, work, gallery, runner))
+            with repeated(signal.SIGTERM):
+                for attempt in (1, 2):
+                    todo = list(_attempt(attempt, todo, out, workers, progress, strict, work, gallery, runner))
         except (KeyboardInterrupt, TerminationSignal):  # Prefect raises its own for SIGTERM
             stop_all()
             raise
@@ -151,14 +155,16 @@ def _convert_catalog(request: CatalogRequest, title: str) -> None:
         items = request.items()
         progress = BatchProgress(len(items))
     todo = (ready(item, request.out, request.strict) for item in items if item.name not in progress.rows)
-    convert_all(todo, request.out, request.workers, title, progress, request.strict, request.where)
+    with leases.running(home.store(), str(request.out)):  # protects the source that is read ahead
+        convert_all(todo, request.out, request.workers, title, progress, request.strict, request.where)
 
 
 def _convert_jobs(jobs: ArtifactRef, out: Path, workers: int, title: str) -> None:
     lines = home.store().path(jobs).read_bytes().splitlines()
     todo = (ConversionJob.model_validate_json(line) for line in lines)
     progress = _reported[out][0] if out in _reported else BatchProgress(len(lines))
-    convert_all(todo, out, workers, title, progress)
+    with leases.running(home.store(), str(out), [jobs]):
+        convert_all(todo, out, workers, title, progress)
 
 
 def _attempt(

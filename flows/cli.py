@@ -83,9 +83,7 @@ def dg4d(
 def make(
     pictures: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="PICTURE...", help="a picture or a video; several make an asset each", show_default=False
-        ),
+        typer.Argument(metavar="PICTURE", help="a picture or a video; several make an asset each", show_default=False),
     ] = None,
     text: Annotated[
         str,
@@ -210,9 +208,9 @@ def motions(
     `dg4d make PICTURE --pick K` uses motion K.
     """
     with exit_on_error():
-        from flows import home
+        from dg4d_lib.errors import BadInput
         from flows.commands import terminal
-        from flows.convert import rank_motions
+        from flows.convert import rank_motions, stored
         from flows.inputs.naming import name_from_path
         from flows.packages.publish import check_writable
 
@@ -221,11 +219,13 @@ def motions(
         item = name_from_path(picture)
         files = {"item": item, "picture": picture, "mask": mask, "depth": depth, "layers": layers}
         request = _request(profile, changes, several, seed=seed, commercial_only=commercial_only, **files)
+        if request.has_motion:
+            raise BadInput(f"motions are generated for a picture, and {picture.name} is a video; give a picture of it")
         folder = out or Path("out") / f"{item}-motions"
         check_writable(folder)
-        job = request.to_job(home.store())
         steps = ("prepare_subject", "drive_video")
-        ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder), steps)
+        with stored(request) as job:
+            ranking = terminal.run_with_progress(job, console, lambda: rank_motions(job, folder), steps)
         rows = [
             (f"{row['number']:>4}", f"{row['total']:.2f}", f"{row['name']}  {'; '.join(row['remarks'])}".rstrip())
             for row in ranking["candidates"]
@@ -393,7 +393,7 @@ def compose(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="output file, .glb or .usdz")],
     packages: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="PACKAGE...", help="folders of assets, from left to right", show_default=False),
+        typer.Argument(metavar="PACKAGE", help="folders of assets, from left to right", show_default=False),
     ] = None,
     scene: Annotated[
         Path | None, typer.Option(metavar="FILE", help="JSON file with positions and start times of the assets")

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from flows import home
 from flows.engine.free_space import require_free_space
-from flows.inputs.conversion_job import ConversionJob
+from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.package_record import record_of
-from flows.packages.publish import Files, is_current, recover
+from flows.packages.publish import Files, check_folder, is_current, recover
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.archives import unpack
@@ -82,8 +82,24 @@ def announcing(say: Callable[[str], None]) -> Iterator[None]:
         _listeners.remove(say)
 
 
+@contextmanager
+def stored(request: ConversionRequest) -> Iterator[ConversionJob]:
+    """Yield the job of a request; no garbage collection removes its files from the store while the block runs.
+
+    Raises:
+        BadInput: a file cannot be read, or the disk is full.
+    """
+    from flows.engine.leases import running
+
+    with running(home.store(), request.item):
+        yield request.to_job(home.store())
+
+
 def convert_job(
-    job: ConversionJob, folder: Path, run: "Callable[[ConversionJob, Path], FlowResult] | None" = None
+    job: ConversionJob,
+    folder: Path,
+    run: "Callable[[ConversionJob, Path], FlowResult] | None" = None,
+    force: bool = True,
 ) -> tuple[Files, bool]:
     """Run the flow of a job and publish the package in `folder`, signed if a key is configured.
 
@@ -94,34 +110,39 @@ def convert_job(
         job: job to convert.
         folder: output folder.
         run: runs the steps and publishes the package; None: the flow, on the connected Prefect server.
+        force: replace the package of another item in `folder`; false: refuse it, also if another run wrote it after the
+            caller looked.
 
     Returns:
         Files of the package, and true if every step was cached.
 
     Raises:
         StepError: a step failed; `folder` is unchanged.
-        BadInput: the folder cannot be written, the disk is full, or the key cannot sign; `folder` is unchanged.
+        BadInput: the folder cannot be written or is refused, the disk is full, or the key cannot sign; `folder` is
+            unchanged.
         BackendUnavailable: a key is configured, and signing is not installed.
         ServerUnavailable: the server ended, and does not answer again.
     """
-    from flows.engine.events import StepEvent, emit
+    from flows.engine.events import remark_on_output
     from flows.engine.leases import running
     from flows.engine.output_lock import output_lock
     from flows.step_errors import StepLost
 
-    def waiting() -> None:
-        emit(StepEvent(job.item, "output", "remark", text=f"waiting for another run that writes {folder}"))
-
+    say = remark_on_output(job.item)
     run = run or run_flow
     cached = True
-    with output_lock(folder, waiting) as waited:
+    with (
+        running(home.store(), job.item, job.given().values()),
+        output_lock(folder, lambda: say(f"waiting for another run that writes {folder}")) as waited,
+    ):
         recover(folder)
+        if not force:
+            check_folder(folder, job.item)
         if not (waited and is_current(folder, job.digest())):
-            with running(home.store(), job.item):
-                try:
-                    result = run(job, folder)
-                except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
-                    result = run(job, folder)
+            try:
+                result = run(job, folder)
+            except (ArtifactMissing, StepLost):  # the cache entry of the missing artifact was dropped
+                result = run(job, folder)
             cached = all(done.cached for done in result.steps)
     return (record_of(folder) or {"files": {}})["files"], cached
 
@@ -160,16 +181,17 @@ def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
     Raises:
         StepError: a step failed.
     """
+    from flows.engine.leases import running
     from flows.pipeline import motions
     from flows.ui.showing import run_again
 
-    with _flow_context(job):
-        outputs = run_again(lambda: motions(job))
     store = home.store()
-    folder.mkdir(parents=True, exist_ok=True)
-    store.get(outputs["candidates"], folder / "motions.png")
-    store.get(outputs["ranking"], folder / "motions.json")
-    unpack(store.path(outputs["films"]), folder, "the zip of films")
+    with running(store, job.item, job.given().values()), _flow_context(job):
+        outputs = run_again(lambda: motions(job))
+        folder.mkdir(parents=True, exist_ok=True)
+        store.get(outputs["candidates"], folder / "motions.png")
+        store.get(outputs["ranking"], folder / "motions.json")
+        unpack(store.path(outputs["films"]), folder, "the zip of films")
     ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
     return ranking
 

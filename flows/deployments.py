@@ -8,10 +8,9 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
-from urllib.parse import urlsplit
 
 import httpx
 from prefect import flow, runtime
@@ -27,13 +26,14 @@ from flows.commands.batch import batch, print_summary
 from flows.commands.benchmark import bench
 from flows.commands.options import shortcut_settings
 from flows.commands.terminal import console
-from flows.convert import connect, convert_job
+from flows.convert import connect, convert_job, stored
+from flows.engine.cancellation import stay_cancelled
 from flows.engine.item_runs import FLOW, failure, read_job
 from flows.engine.orphans import claim_run
 from flows.engine.output_lock import is_up_to_date
 from flows.engine.shared_results import sharing_results
 from flows.inputs.conversion_job import ConversionRequest
-from flows.inputs.fetching import local_copy, without_secrets
+from flows.inputs.fetching import item_name, local_copy, without_secrets
 from flows.inputs.given_views import ViewsRequest, parse_views
 from flows.inputs.manifest import box_settings, parse_changes
 from flows.inputs.naming import name_from_path
@@ -193,7 +193,9 @@ FormOptions = Annotated[Options, Field(json_schema_extra=_options_field(Options(
 FormPictureOptions = Annotated[PictureOptions, Field(json_schema_extra=_options_field(PictureOptions()))]
 
 
-@flow(name="picture-to-4d", flow_run_name=lambda: _run_name("picture"), persist_result=False)
+@flow(
+    name="picture-to-4d", flow_run_name=lambda: _run_name("picture"), persist_result=False, on_crashed=[stay_cancelled]
+)
 def picture_to_4d(
     picture: Annotated[Text, Field(json_schema_extra=_title("Picture"))],
     out: Folder,
@@ -214,7 +216,7 @@ def picture_to_4d(
     _convert(picture, out, options, sides, cutout)
 
 
-@flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False)
+@flow(name="video-to-4d", flow_run_name=lambda: _run_name("video"), persist_result=False, on_crashed=[stay_cancelled])
 def video_to_4d(
     video: Annotated[Text, Field(json_schema_extra=_title("Video"))],
     out: Folder,
@@ -235,7 +237,7 @@ def video_to_4d(
     _convert(video, out, options, sides, cutout, is_video=True)
 
 
-@flow(name="model-to-4d", flow_run_name=lambda: _run_name("model"), persist_result=False)
+@flow(name="model-to-4d", flow_run_name=lambda: _run_name("model"), persist_result=False, on_crashed=[stay_cancelled])
 def model_to_4d(
     model: Annotated[Text, Field(json_schema_extra=_title("Model"))],
     out: Folder,
@@ -258,7 +260,9 @@ def model_to_4d(
     _publish(_request(item, options, roots, picture=shown, asset=path), folder)
 
 
-@flow(name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False)
+@flow(
+    name="catalog-to-4d", flow_run_name=lambda: _run_name("inputs"), persist_result=False, on_crashed=[stay_cancelled]
+)
 def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
     out: Folder,
@@ -299,7 +303,7 @@ def catalog_to_4d(
     return Failed(message=text) if failed else Completed(message=text)
 
 
-@flow(name=FLOW, flow_run_name="{item}", persist_result=False)
+@flow(name=FLOW, flow_run_name="{item}", persist_result=False, on_crashed=[stay_cancelled])
 def item_to_4d(
     item: Annotated[Text, Field(json_schema_extra=_title("Item"))],
     job: Annotated[ArtifactRef, Field(json_schema_extra=_title("ConversionJob"))],
@@ -321,7 +325,7 @@ def item_to_4d(
     return Completed(message="every step was already done" if outcome.cached else "done")
 
 
-@flow(name="benchmark", flow_run_name="{dataset}", persist_result=False)
+@flow(name="benchmark", flow_run_name="{dataset}", persist_result=False, on_crashed=[stay_cancelled])
 def benchmark(
     dataset: Annotated[Text, Field(json_schema_extra=_title("Data set"))],
     out: Folder,
@@ -398,8 +402,8 @@ def _convert(address: str, out: str, options: Options, sides: Sides, cutout: Cut
     named = {"mask": cutout.mask, "depth": cutout.depth, "layers": cutout.layers, "asset": sides.asset}
     own = {name: Path(text) if text else None for name, text in named.items()}
     roots.check_files([*given.files(), *filter(None, own.values())])
-    item = name_from_path(PurePosixPath(urlsplit(address).path))
-    with local_copy(roots.source(address)) as path:
+    source, item = roots.source(address), item_name(address)
+    with local_copy(source) as path:
         files = {"picture": path, "video": path if is_video else None, **own}
         request = _request(item, options, roots, box_settings(cutout.box), given_views=given, **files)
         _publish(request, folder)
@@ -423,10 +427,10 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     """Convert a request into a folder, unless its package is there already."""
     request.check()
     check_folder(folder, request.item)
-    job = request.to_job(home.store())
-    if not is_up_to_date(folder, job.digest()):
-        _patiently(connect)
-        convert_job(job, folder)
+    with stored(request) as job:
+        if not is_up_to_date(folder, job.digest()):
+            _patiently(connect)
+            convert_job(job, folder, force=False)
 
 
 def _patiently(work: Callable[[], None]) -> None:

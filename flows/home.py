@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dg4d_lib.errors import BadInput
 from steps.store.artifact_store import ArtifactStore
-from steps.store.files import home
+from steps.store.files import home, walk
 from steps.store.opening import open_store
 
 OTHERS = 0o077  # permission bits of group and others
@@ -90,7 +90,7 @@ def make_private(folder: Path) -> None:
         ) from error
     if folder.stat().st_mode & OTHERS:
         return  # a file system without permissions
-    for path in folder.rglob("*"):
+    for path in walk(folder):
         with suppress(OSError):  # removed meanwhile, or a file system without permissions
             if not path.is_symlink():
                 path.chmod(stat.S_IMODE(path.stat().st_mode) & ~OTHERS)

@@ -18,6 +18,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 from flows import home
 from flows.convert import convert_job, prepare
 from flows.engine import resources
+from flows.engine.events import remark_on_output
 from flows.engine.executors import stop_all
 from flows.engine.file_locks import FileLocks
 from flows.engine.free_space import require_free_space
@@ -41,7 +42,7 @@ P = ParamSpec("P")
 R = TypeVar("R", bound=StepResult)
 
 
-def convert_inline(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
+def convert_inline(job: ConversionJob, folder: Path, force: bool = True) -> tuple[Files, bool]:
     """Run a job in this process and publish the package in `folder`; see `convert_job`.
 
     Raises:
@@ -52,7 +53,7 @@ def convert_inline(job: ConversionJob, folder: Path) -> tuple[Files, bool]:
     require_free_space(store_home())
     with _stoppable():
         prepare(job)
-        return convert_job(job, folder, run_inline)
+        return convert_job(job, folder, run_inline, force)
 
 
 def run_inline(job: ConversionJob, folder: Path) -> FlowResult:
@@ -71,7 +72,7 @@ def run_inline(job: ConversionJob, folder: Path) -> FlowResult:
     wall_s = round((time.time_ns() - conversion.begun_ns) / 1e9, 3)
     result = FlowResult(package=package.package, steps=engine.tasks.finished(), wall_s=wall_s)
     keep_version(home.store(), job, result)
-    deliver(job, result, folder, configured_signer())
+    deliver(job, result, folder, configured_signer(), remark_on_output(job.item))
     return result
 
 

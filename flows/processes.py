@@ -116,7 +116,8 @@ def end(process: subprocess.Popen[bytes], grace_s: float) -> None:
 
 
 def exit_guard(number: int, frame: FrameType | None) -> None:
-    """Handle SIGTERM in a guard: exit, with its `finally` clauses."""
+    """Handle SIGTERM in a guard: exit, with its `finally` clauses, which no further SIGTERM interrupts."""
+    signal.signal(number, signal.SIG_IGN)
     sys.exit(0)
 
 

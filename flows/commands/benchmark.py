@@ -11,6 +11,7 @@ from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
 from flows import home
 from flows.commands import terminal
+from flows.engine.leases import running
 from flows.engine.output_lock import is_up_to_date
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING, EXIT_STATUS
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
@@ -80,13 +81,13 @@ def score(
     from flows.benchmark import BenchmarkEntry, score_assets
     from flows.engine.step_tasks import flow_context
 
-    entry = BenchmarkEntry(
-        name=found.name,
-        truth=put_truth(found, home.store()),
-        package=put_package(package, record, home.store()),
-        seconds=_seconds(record),
-    )
-    with terminal.steps_shown(console), flow_context():
+    with running(home.store(), str(package)), terminal.steps_shown(console), flow_context():
+        entry = BenchmarkEntry(
+            name=found.name,
+            truth=put_truth(found, home.store()),
+            package=put_package(package, record, home.store()),
+            seconds=_seconds(record),
+        )
         judged = score_assets(
             [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
         )
@@ -156,20 +157,20 @@ def bench(
     from flows.convert import connect
 
     connect()
-    rows = _converted(
-        [request.to_job(home.store()) for request in requests], out / ASSETS, workers, console, dataset.name
-    )
     from flows.benchmark import score_assets
     from flows.engine.step_tasks import flow_context
 
-    entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
-    title = f"{dataset.absolute().name}, {profile_name}{', ground-truth views as prior' if bank else ''}"
-    with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
-        judged = score_assets(entries, settings, title, profile_name, seed)
-        for one in judged.results.objects:
-            table.settle(one.object, "failed" if one.error else "done", one.error)
-    results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": given}})
-    write(results, judged, out)
+    with running(home.store(), str(out)):
+        jobs = [request.to_job(home.store()) for request in requests]
+        rows = _converted(jobs, out / ASSETS, workers, console, dataset.name)
+        entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
+        title = f"{dataset.absolute().name}, {profile_name}{', ground-truth views as prior' if bank else ''}"
+        with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
+            judged = score_assets(entries, settings, title, profile_name, seed)
+            for one in judged.results.objects:
+                table.settle(one.object, "failed" if one.error else "done", one.error)
+        results = judged.results.model_copy(update={"settings": {**judged.results.settings, "changes": given}})
+        write(results, judged, out)
     return results
 
 

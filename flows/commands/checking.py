@@ -105,13 +105,13 @@ def rebuild(
     with exit_on_error():
         from flows import home
         from flows.commands import terminal
+        from flows.engine.leases import running
         from flows.inputs.conversion_job import job_from_record
         from flows.packages.publish import check_folder, load_verified
 
         record = load_verified(package)
         if out is not None:
             check_folder(out)
-        job = job_from_record(record, home.store(), source, bank, mask, depth, layers, asset)
         console = terminal.console(stderr=as_json)
 
         def work() -> "RebuildReport":
@@ -119,7 +119,10 @@ def rebuild(
 
             return rebuild_package(package, record, job, out)
 
-        _print_result(terminal.run_with_progress(job, console, work), as_json)
+        with running(home.store(), str(package)):  # protects the files of the job until `work` does
+            job = job_from_record(record, home.store(), source, bank, mask, depth, layers, asset)
+            found = terminal.run_with_progress(job, console, work)
+        _print_result(found, as_json)
 
 
 def _print_scores(results: "Results", console: "Console") -> None:

@@ -29,6 +29,7 @@ from flows.processes import start_reminder
 __all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
+NO_FOLDER = {errno.EEXIST, errno.ENOENT, errno.ENOTDIR}  # of mkdir, where a file is or where no folder can be
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; run the same command again to continue after the last finished step"
 
@@ -109,7 +110,6 @@ def _describe(error: Exception) -> tuple[str, int]:
     from flows.serving.server import ServerUnavailable
     from flows.step_errors import StepBadInput, StepDiverged, StepError, StepMissing
     from steps.store.artifact_store import ArtifactMissing
-    from steps.store.files import NO_SPACE
 
     text = error.message if isinstance(error, StepError) else str(error)
     match error:
@@ -121,21 +121,46 @@ def _describe(error: Exception) -> tuple[str, int]:
             return text, EXIT_MISSING
         case StepError():
             return str(error), EXIT_FAILED
-        case OSError() if error.errno in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
-            advice = "free some space and try again" if error.errno in NO_SPACE else "choose another path"
-            if error.errno == errno.EROFS and (variable := _variable_of(str(error.filename))):
-                advice = f"name a writable folder in ${variable}"
-            return f"{error.strerror}: {error.filename or 'the disk'}; {advice}", EXIT_BAD_INPUT
+        case OSError() if sentence := _unusable_folder(error) or _refused_path(error):
+            return sentence, EXIT_BAD_INPUT
     return f"internal error ({type(error).__name__}: {error}); traceback: {_save_traceback(error)}", EXIT_FAILED
+
+
+def _unusable_folder(error: OSError) -> str:
+    """Return a sentence if the folder of an environment variable is a file or cannot be created, else nothing."""
+    variable = _variable_of(str(error.filename)) if error.errno in NO_FOLDER else ""
+    folder = _folders().get(variable)
+    if folder is None or folder.is_dir():
+        return ""
+    state = "is not a folder" if folder.exists() else f"cannot be created ({error.strerror})"
+    return f"${variable} {state}: {folder}; name a folder that can be written to"
+
+
+def _refused_path(error: OSError) -> str:
+    """Return a sentence if the path or the disk is the user's to change, else nothing."""
+    from steps.store.files import NO_SPACE
+
+    if error.errno not in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
+        return ""
+    advice = "free some space and try again" if error.errno in NO_SPACE else "choose another path"
+    if error.errno == errno.EROFS and (variable := _variable_of(str(error.filename))):
+        advice = f"name a writable folder in ${variable}"
+    return f"{error.strerror}: {error.filename or 'the disk'}; {advice}"
+
+
+def _folders() -> dict[str, Path]:
+    """Return the folders that environment variables name, and the home folder, by variable."""
+    from steps.store.files import FOLDER_VARIABLES, home
+
+    given = {name: Path(folder) for name in FOLDER_VARIABLES if (folder := os.environ.get(name))}
+    return {"DG4D_HOME": home()} | given
 
 
 def _variable_of(path: str) -> str:
     """Return the environment variable that names the folder of a path; empty if none does."""
-    from steps.store.files import FOLDER_VARIABLES, home
+    from steps.store.files import home
 
-    given = {name: Path(folder) for name in FOLDER_VARIABLES if (folder := os.environ.get(name))}
-    folders = {"DG4D_HOME": home()} | given
-    holding = {name: len(folder.parts) for name, folder in folders.items() if Path(path).is_relative_to(folder)}
+    holding = {name: len(folder.parts) for name, folder in _folders().items() if Path(path).is_relative_to(folder)}
     to_create = "DG4D_HOME" if home().is_relative_to(path) else ""
     return max(holding, key=holding.__getitem__, default=to_create)
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dg4d_lib.errors import BadInput, DG4DError
-from flows import home
 from flows.commands import terminal
-from flows.convert import convert_job
+from flows.convert import convert_job, stored
 from flows.engine.output_lock import is_up_to_date
 from flows.exit_status import exit_status_of
 from flows.inputs.conversion_job import ConversionRequest, name_from_text
@@ -86,14 +85,14 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
     request = wish.request(item, picture)
     if wish.picked and request.has_motion:
         raise BadInput(f"--pick chooses a generated motion, and {request.source_name} is a video; leave --pick out")
-    for sentence in request.unused():
+    for sentence in (*request.unused(), *request.license_conditions()):
         console.print(f"note: {sentence}", markup=False)
     check_folder(folder, item, wish.force)
-    job = request.to_job(home.store())
-    named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
-    cached = named == item and is_up_to_date(folder, job.digest())
-    if not cached:
-        _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder))
+    with stored(request) as job:
+        named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
+        cached = named == item and is_up_to_date(folder, job.digest())
+        if not cached:
+            _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder, force=wish.force))
     if cached:
         console.print("nothing to do: every step was already done")
     written = (record_of(folder) or {"files": {}})["files"]

@@ -9,6 +9,8 @@ from typing import Any, Literal
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows import home
 from flows.convert import run_flow
+from flows.engine.events import remark_on_output
+from flows.engine.leases import running
 from flows.exit_status import EXIT_FAILED
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured_signer
@@ -91,15 +93,16 @@ def rebuild(folder: Path, record: Mapping[str, Any], job: ConversionJob, out: Pa
         )
     first = dict(zip(labels, record["steps"], strict=True))
     machines = {run["step"]: run.get("machine", {}) for run in record["run"]["steps"]}
-    made = run_flow(job, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
-    again = {done.label: done.result for done in made.steps}
-    if out is not None:
-        deliver(job, made, out, signer)
-    with TemporaryDirectory(prefix="dg4d-rebuild-") as scratch:
-        new = Path(scratch) / "new"
-        new.mkdir()
-        files = unpacked(home.store().path(made.package), new)
-        comparisons = [*_steps(record, first, again, Path(scratch)), *_files(record, folder, files, new)]
+    with running(home.store(), job.item, job.given().values()):
+        made = run_flow(job, refresh=True, mesh_parts=sum(label.startswith("extract_mesh ") for label in labels))
+        again = {done.label: done.result for done in made.steps}
+        if out is not None:
+            deliver(job, made, out, signer, remark_on_output(job.item))
+        with TemporaryDirectory(prefix="dg4d-rebuild-") as scratch:
+            new = Path(scratch) / "new"
+            new.mkdir()
+            files = unpacked(home.store().path(made.package), new)
+            comparisons = [*_steps(record, first, again, Path(scratch)), *_files(record, folder, files, new)]
     changes = dict.fromkeys(_environment_changes(first, machines, again))
     return RebuildReport(package=str(folder), environment_changes=tuple(changes), comparisons=tuple(comparisons))
 

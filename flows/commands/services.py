@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 POLL_S = 1.0  # between two scans of a watched folder
 RESULTS_EVERY_S = 5.0  # between two looks for finished packages
+OF_CATALOGS = "item-to-4d/"  # flow whose deployments only catalogs start
 FORM = "then choose Deployments, Picture to 4D, Run"
 OPEN_OWN = f"open this address first: it signs the browser in to the Prefect UI; {FORM}"
 OPEN_OTHER = f"open this address, the Prefect UI of $PREFECT_API_URL; {FORM}"
@@ -132,10 +133,10 @@ def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, qu
     connect()
     from flows.serving.registering import register
 
-    names = register(known, chosen)
-    if not quiet:
+    forms = [name for name in register(known, chosen) if not name.startswith(OF_CATALOGS)]
+    if forms and not quiet:
         typer.echo("deployments, forms that run from the Prefect UI:", err=True)
-        for name in names:
+        for name in forms:
             typer.echo(name)
     api_url = os.environ["PREFECT_API_URL"]
     server.folder.mkdir(parents=True, exist_ok=True)

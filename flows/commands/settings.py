@@ -40,7 +40,16 @@ def settings(
 def _details(one: "Setting") -> str:
     default = f"; default {one.default}" if one.default else ""
     paragraphs = (one.meaning, f"allowed: {one.allowed}{default}")
-    return "\n".join(
-        textwrap.fill(text, COLUMNS, initial_indent=INDENT, subsequent_indent=INDENT, break_long_words=False)
-        for text in paragraphs
+    return "\n".join(map(indented, paragraphs))
+
+
+def indented(text: str) -> str:
+    """Return a paragraph, indented and broken between words."""
+    return textwrap.fill(
+        text,
+        COLUMNS,
+        initial_indent=INDENT,
+        subsequent_indent=INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.commands.endings import exit_on_error
+from flows.commands.settings import indented
 
 if TYPE_CHECKING:
     from dg4d_lib.weights.lock import LockEntry
@@ -21,7 +22,7 @@ weights = typer.Typer(
 NOT_COMPARED = "there are no published digests to compare with"
 Names = Annotated[
     list[str],
-    typer.Argument(metavar="NAME...", help="a name from `dg4d weights list`, or the id of a Hugging Face repository"),
+    typer.Argument(metavar="NAME", help="a name from `dg4d weights list`, or the id of a Hugging Face repository"),
 ]
 
 
@@ -42,7 +43,7 @@ def show(
         for one, (*columns, license_text) in rows:
             typer.echo(_columns(columns, width))
             for text in (license_text, one.purpose, one.hub_id):  # below the row, so that no name is broken
-                typer.echo(f"    {visible(text)}")
+                typer.echo(indented(visible(text)))
         typer.echo(f"folder: {weights_home()}; a setting may name another folder instead")
         typer.echo("the first pull records revision and digests; later uses are checked against them")
         for one in _all_of_them() if files else ():
@@ -55,7 +56,7 @@ def pull(
     names: Annotated[
         list[str],
         typer.Argument(
-            metavar="NAME...",
+            metavar="NAME",
             help="a profile, whose weights are all downloaded; a name from `dg4d weights list`; or the id of a "
             "Hugging Face repository",
         ),
@@ -88,7 +89,7 @@ def pull(
 
 @weights.command()
 def check(
-    names: Annotated[list[str] | None, typer.Argument(metavar="NAME...", help="default: all that are present")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="default: all that are present")] = None,
 ) -> None:
     """Verify every file against recorded or published digests."""
     with exit_on_error():
@@ -190,7 +191,7 @@ def _row(one: "Weights", locked: "LockEntry | None") -> list[str]:
         here = ("yes" if own else "hub cache") if whole else "damaged"
     size = _size(locked) if locked else f"~{one.about_gb:g}" if one.about_gb else "?"
     revision = locked.revision if locked else one.revision or "-"
-    return [one.name, here, size, revision[:10], one.license.commercial, one.license.name]
+    return [one.name, here, size, revision[:10], one.license.commercial, str(one.license)]
 
 
 def _files_of(one: "Weights", locked: "LockEntry | None") -> list[tuple[str, str, str]]:

@@ -64,3 +64,8 @@ def emit(event: StepEvent) -> None:
     """Call the listeners of this process and of this context with an event."""
     for listener in (*_listeners, *_of_context.get()):
         listener(event)
+
+
+def remark_on_output(item: str) -> Callable[[str], None]:
+    """Return a function that emits a sentence about the output folder of an item."""
+    return lambda text: emit(StepEvent(item, "output", "remark", text=text))

@@ -27,8 +27,8 @@ from prefect.states import Cancelled, Scheduled
 from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from flows import home
 from flows.engine import resources
-from flows.engine.events import StepEvent, emit
-from flows.engine.leases import hold, running
+from flows.engine.events import StepEvent, emit, remark_on_output
+from flows.engine.leases import running
 from flows.engine.output_lock import output_lock
 from flows.inputs.conversion_job import ConversionJob
 from flows.inputs.package_record import record_of
@@ -90,17 +90,12 @@ class ItemDeployment(NamedTuple):
         """
         store = home.store()
         ref = store.put_bytes(job.model_dump_json().encode(), JOB_MEDIA_TYPE)
-        with running(store, job.item):
-            hold(
-                store,
-                job.item,
-                [ref.digest, *(needed.digest for needed in job.given().values())],
-            )
+        with running(store, job.item, [ref, *job.given().values()]):
             outcome = self._outcome(job, ref, store)
             if outcome.package is None:
                 raise ItemFailed(outcome)
             with output_lock(folder, lambda: None):
-                files = unpack_package(outcome.package, folder, store)
+                files = unpack_package(outcome.package, folder, store, remark_on_output(job.item))
         if (record_of(folder) or {}).get("order") != job.digest():
             note = "converted with weights, a rasterizer or a signing key that differ from those of this machine"
             emit(StepEvent(job.item, STEP, "remark", text=note))

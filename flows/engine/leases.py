@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from dg4d_lib.errors import BadInput
 from flows.processes import OWN_START, host_id, locked, start_of
-from steps.contract import Digest, Frozen
+from steps.contract import ArtifactRef, Digest, Frozen
 from steps.store.artifact_store import ArtifactStore, Entry
 
 FOLDER = "running"
@@ -53,9 +53,9 @@ class Lease(Holder):
     """Artifacts that one process needs for one item.
 
     Attributes:
-        item: name of the asset.
+        item: name of the asset, or the output folder of several.
         age_s: age of the process when it wrote the lease.
-        artifacts: cached results that it uses; new ones are protected by their age.
+        artifacts: sources and cached results that it uses; new ones are protected by their age.
     """
 
     item: str
@@ -70,8 +70,13 @@ class Collecting(Holder):
 
 
 @contextmanager
-def running(store: ArtifactStore, item: str) -> Iterator[None]:
-    """Hold a lease for an item while the block runs.
+def running(store: ArtifactStore, item: str, given: Iterable[ArtifactRef] = ()) -> Iterator[None]:
+    """Hold a lease for an item while the block runs, which also protects what this process stores meanwhile.
+
+    Args:
+        store: store of the artifacts.
+        item: name of the asset, or the output folder of several.
+        given: artifacts that were stored before.
 
     Raises:
         StoreUnreachable: the store does not answer.
@@ -79,7 +84,7 @@ def running(store: ArtifactStore, item: str) -> Iterator[None]:
     with _mutex:
         _users[item] = _users.get(item, 0) + 1
     try:
-        hold(store, item, ())
+        hold(store, item, (ref.digest for ref in given))
         yield
     finally:
         with _mutex:

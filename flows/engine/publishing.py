@@ -7,6 +7,7 @@ from prefect.cache_policies import NO_CACHE
 
 from flows import home
 from flows.engine import versions
+from flows.engine.events import remark_on_output
 from flows.inputs.conversion_job import ConversionJob
 from flows.packages.credentials import configured_signer
 from flows.packages.flow_result import FlowResult
@@ -29,7 +30,7 @@ def publish(package: StepResult, verdict: StepResult, job: ConversionJob, result
         BadInput: the folder cannot be written, the disk is full, or the key cannot sign; the folder is as it was.
         BackendUnavailable: a key is configured, and signing is not installed.
     """
-    deliver(job, result, folder, configured_signer())
+    deliver(job, result, folder, configured_signer(), remark_on_output(job.item))
 
 
 @task(name="keep_version", task_run_name="keep_version: {job.item}", cache_policy=NO_CACHE, persist_result=False)

@@ -108,7 +108,7 @@ class ConversionRequest(Frozen):
             self._check_asset(self.asset)
         self._check_source()
         if self.mask is not None:
-            sources.check_mask(self.mask)
+            sources.check_option(self.mask, "--mask", "give a picture, or a folder of frames for a video")
         self._check_depth()
         self.given_views.check(self._footage)
         if self.given_views and self.text:
@@ -152,6 +152,11 @@ class ConversionRequest(Frozen):
             raise BadInput(
                 f"--commercial-only: the settings name weights that may not be used commercially: {'; '.join(refused)}"
             )
+
+    def license_conditions(self) -> list[str]:
+        """Return a sentence for all weights of the request whose license allows commercial use under conditions."""
+        licenses = {name: license_of(name) for name in self._weights()}
+        return [f"license of {name}: {its}" for name, its in licenses.items() if its.commercial == "conditions"]
 
     def to_job(self, store: ArtifactStore) -> "ConversionJob":
         """Put the files into the store and return the job.
@@ -221,10 +226,14 @@ class ConversionRequest(Frozen):
             if self.text:
                 raise BadInput(f"{option} shows the depth of a picture or video of yours, and --text has none")
             if self.asset is not None or self.given_views:
-                other = "--asset has" if self.asset is not None else "--view, --turntable and --cameras show"
-                raise BadInput(f"{option} helps to guess the sides of one picture, and {other} them; leave one out")
+                other = "--asset" if self.asset is not None else "--view, --turntable or --cameras"
+                raise BadInput(
+                    f"{option} cannot be combined with {other}, from which the shape is known already; leave one out"
+                )
         if len(given) > 1:
-            raise BadInput("--depth says more than --layers; give one of them")
+            raise BadInput(
+                "--depth and --layers cannot be combined; keep --depth if it is accurate, otherwise --layers"
+            )
 
     def _check_source(self) -> None:
         if self.text:
@@ -240,7 +249,7 @@ class ConversionRequest(Frozen):
                 )
             return
         if self.video is not None:
-            sources.check_video(self.video)
+            sources.check_option(self.video, "--video")
         if self.picture is not None:
             sources.check_file(self.picture)
         elif self.video is None and self.asset is None:

@@ -16,6 +16,7 @@ from urllib.parse import SplitResult, quote, unquote, urljoin, urlsplit
 
 from dg4d_lib.errors import BadInput
 from flows.inputs import hosts, listing
+from flows.inputs.naming import name_from_path
 from flows.inputs.sources import LARGEST_FILE_BYTES
 from steps.sources.media_types import SNIFFED_BYTES, check_head
 from steps.store.files import NO_SPACE, room_for
@@ -47,7 +48,7 @@ def local_copy(address: str) -> Iterator[Path]:
         return
     shown = without_secrets(address)
     parts = _split(address)
-    name = PurePosixPath(unquote(parts.path)).name
+    name = _file_name(parts, address)
     fits = bool(name) and "\0" not in name and len(name.encode(errors="replace")) <= LONGEST_NAME
     if parts.scheme not in {*SCHEMES, "s3"} or not parts.hostname or not fits:
         raise BadInput(f"{shown} names no file: give a path, https://HOST/FILE or s3://BUCKET/KEY")
@@ -60,6 +61,17 @@ def local_copy(address: str) -> Iterator[Path]:
         path = Path(scratch) / name
         _Download().fetch(address, path)
         yield path
+
+
+def item_name(address: str) -> str:
+    """Return the name that the file, or the local folder of frames, at an address gives its asset.
+
+    Raises:
+        BadInput: the address is invalid.
+    """
+    if "://" not in address:
+        return name_from_path(Path(address))
+    return name_from_path(PurePosixPath(_file_name(_split(address), address)))
 
 
 def without_secrets(address: str) -> str:
@@ -197,6 +209,12 @@ def _split(address: str) -> SplitResult:
     except ValueError as error:
         raise BadInput(f"an address is https://HOST/FILE or s3://BUCKET/KEY; this one is invalid: {error}") from error
     return parts
+
+
+def _file_name(parts: SplitResult, address: str) -> str:
+    """Return the last part of an address; the key of an object is literal, also with `#`, `?` and `%`."""
+    key = address.partition("://")[2].partition("/")[2]
+    return PurePosixPath(key if parts.scheme == "s3" else unquote(parts.path)).name
 
 
 def _target(parts: SplitResult) -> str:

@@ -79,7 +79,7 @@ class ViewsRequest(Frozen):
             sources.check_file(view.path, "give a picture")
         check_apart([(view.azimuth, view.elevation, view.path.name) for view in self.views])
         if self.turntable is not None:
-            sources.check_video(self.turntable)
+            sources.check_option(self.turntable, "--turntable")
         if self.cameras is not None:
             for path, _ in _frames(self.cameras):
                 naming.check_text(path.name, "the file name")

@@ -11,6 +11,7 @@ from dg4d_lib.errors import BadInput
 from flows.inputs import sources
 from flows.inputs.package_record import record_of
 from steps.artifacts.archives import stays_inside
+from steps.store.files import walk
 from steps.store.opening import open_store
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Found(NamedTuple):
 
 def list_folder(folder: Path, out: Path) -> list[Found]:
     """List a folder recursively, by name, without packages, hidden files and `out`."""
-    return _media(folder, folder.rglob("*"), out)
+    return _media(folder, walk(folder), out)
 
 
 def list_pattern(pattern: str, out: Path) -> list[Found]:
@@ -52,7 +53,8 @@ def list_pattern(pattern: str, out: Path) -> list[Found]:
     first = next(i for i, part in enumerate(parts) if WILDCARDS & set(part))
     base = Path(*parts[:first])
     if not base.is_dir():
-        raise BadInput(f"{base}, where the pattern {pattern!r} begins, is not a folder")
+        state = "is not a folder" if base.exists() else "does not exist"
+        raise BadInput(f"the pattern {pattern!r} matches nothing: {base} {state}")
     try:
         return _media(base, base.glob("/".join(parts[first:])), out)
     except ValueError as error:

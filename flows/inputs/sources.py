@@ -76,14 +76,18 @@ def check_file(path: Path, wanted: str = "give a picture or a video") -> None:
         raise BadInput(f"{path}: {error}") from error
 
 
-def check_video(path: Path) -> None:
+def check_video(path: Path, wanted: str = "give a picture or a video") -> None:
     """Refuse files as `check_file` does, and folders with fewer than two frames.
+
+    Args:
+        path: file or folder that is read.
+        wanted: advice where it is missing or empty.
 
     Raises:
         BadInput: says what is wrong and what to give.
     """
     if not path.is_dir():
-        check_file(path)
+        check_file(path, wanted)
     elif len(frames := list_frames(path)) < 2:
         raise BadInput(
             f"{path} holds {len(frames) or 'no'} picture{'s' * (len(frames) != 1)}; a folder of frames needs two or "
@@ -95,16 +99,21 @@ def check_video(path: Path) -> None:
             check_still(frame)
 
 
-def check_mask(path: Path) -> None:
-    """Refuse masks as `check_video` refuses videos.
+def check_option(path: Path, option: str, wanted: str = "give a video or a folder of frames") -> None:
+    """Refuse the file or folder of an option as `check_video` does.
+
+    Args:
+        path: file or folder that is read.
+        option: that it was given with.
+        wanted: advice where it is missing or empty.
 
     Raises:
-        BadInput: says what is wrong and what to give.
+        BadInput: names the option; says what is wrong and what to give.
     """
     try:
-        check_video(path)
+        check_video(path, wanted)
     except BadInput as error:
-        raise BadInput(f"--mask: {error}") from error
+        raise BadInput(f"{option}: {error}") from error
 
 
 def check_still_file(path: Path, option: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from flows.inputs.sources import put_zip
-from flows.packages.publish import Files, load_verified, publish
+from flows.packages.publish import Files, Say, load_verified, publish
 from steps.contract import ArtifactRef, Frozen
 from steps.store.artifact_store import ArtifactStore
 
@@ -52,8 +52,8 @@ def pack_package(folder: Path, store: ArtifactStore) -> ArtifactRef:
     return put_zip({file.relative_to(folder).as_posix(): file for file in files}, PACKED, store)
 
 
-def unpack_package(package: ArtifactRef, folder: Path, store: ArtifactStore) -> Files:
-    """Replace the package in `folder` by a packed one; return the digests of its files.
+def unpack_package(package: ArtifactRef, folder: Path, store: ArtifactStore, say: Say = lambda _: None) -> Files:
+    """Replace the package in `folder` by a packed one; return the digests of its files; see `publish`.
 
     Raises:
         ArtifactMissing: the package is gone.
@@ -64,7 +64,7 @@ def unpack_package(package: ArtifactRef, folder: Path, store: ArtifactStore) -> 
         files: Files = load_verified(staging)["files"]
         return files
 
-    return publish(store.path(package), folder, check)
+    return publish(store.path(package), folder, check, say)
 
 
 def write_outcome(store: ArtifactStore, run: str, outcome: Outcome) -> None:

@@ -1,8 +1,10 @@
 """Atomic replacement of the package in an output folder."""
 
 import errno
+import filecmp
 import glob
 import hashlib
+import itertools
 import os
 import tempfile
 from collections.abc import Callable
@@ -20,6 +22,7 @@ CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS,
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}
 Finish = Callable[[Path, Files], Files]
+Say = Callable[[str], None]
 
 
 def check_folder(folder: Path, item: str = "", force: bool = False) -> None:
@@ -102,16 +105,18 @@ def load_verified(folder: Path) -> dict[str, Any]:
     return record
 
 
-def publish(package: Path, folder: Path, finish: Finish) -> Files:
+def publish(package: Path, folder: Path, finish: Finish, say: Say = lambda _: None) -> Files:
     """Unpack a package beside `folder`, finish it, and replace the package in `folder`.
 
-    Files in `folder` that no package brought stay. If anything fails, `folder` is as it was.
+    Files in `folder` that no package brought stay; one whose name the new package brings gets another name, `mesh.glb`
+    becomes `mesh.mine.glb`. If anything fails, `folder` is as it was.
 
     Args:
         package: zip of `pack_asset`.
         folder: output folder.
         finish: called with the unpacked folder and the digests of its files; adds record and reports, and returns the
             digests of the package's files after that.
+        say: called with a sentence for every file that was renamed.
 
     Returns:
         Digests of the files of the new package.
@@ -125,11 +130,11 @@ def publish(package: Path, folder: Path, finish: Finish) -> Files:
     try:
         with room_for(folder):
             try:
-                return _publish(package, folder, finish)
+                return _publish(package, folder, finish, say)
             except OSError as error:
                 if error.errno not in CANNOT_SWAP or not folder.is_dir():
                     raise
-                return _publish(package, folder, finish, in_place=True)
+                return _publish(package, folder, finish, say, in_place=True)
     except BaseException as error:
         _remove_empty(missing)
         if isinstance(error, OSError):
@@ -183,7 +188,7 @@ def bytes_digest(content: bytes) -> dict[str, Any]:
     return {"digest": f"sha256:{hashlib.sha256(content).hexdigest()}", "size_bytes": len(content)}
 
 
-def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False) -> Files:
+def _publish(package: Path, folder: Path, finish: Finish, say: Say, in_place: bool = False) -> Files:
     if folder.exists() and not folder.is_dir():  # created since the output was checked
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     place = folder if in_place else folder.parent
@@ -196,12 +201,12 @@ def _publish(package: Path, folder: Path, finish: Finish, in_place: bool = False
         staging.mkdir()
         files = finish(staging, unpacked(package, staging))
         if in_place or Path.cwd().is_relative_to(folder):
-            _move_in(staging, folder, before)
+            _move_in(staging, folder, before, say)
             remove_tree(before)
         else:
             _swap(staging, folder, before)
             if before.exists():
-                _carry_over(before, folder)
+                _carry_over(before, folder, say)
         return files
     finally:
         remove_tree(staging)
@@ -244,30 +249,65 @@ def _swap(staging: Path, folder: Path, before: Path) -> None:
         raise
 
 
-def _carry_over(outgoing: Path, folder: Path) -> None:
+def _carry_over(outgoing: Path, folder: Path, say: Say = lambda _: None) -> None:
     """Move the user's files over from the folder of an earlier package, and remove that."""
-    for name in _foreign(outgoing):
-        target = folder / name
-        if not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            (outgoing / name).replace(target)
+    knows_its_own = record_of(outgoing) is not None  # else `_move_in` was interrupted, and these may be of a package
+    for name in sorted(_foreign(outgoing), key=lambda name: (folder / name).exists()):  # names that stay first
+        is_lost = knows_its_own and not _is_equal(outgoing / name, folder / name)
+        if is_lost or not (folder / name).exists():
+            _set_aside(outgoing / name, folder, name, say)
     remove_tree(outgoing)
 
 
-def _move_in(staging: Path, folder: Path, before: Path) -> None:
+def _set_aside(path: Path, folder: Path, name: Path, say: Say) -> None:
+    """Move a file of the user to `name` in a folder, or to a similar name if a package has something there."""
+    place = _free_name(folder, name)
+    (folder / place).parent.mkdir(parents=True, exist_ok=True)
+    path.replace(folder / place)
+    if place != name:
+        say(f"your own file {name} in {folder} is {place} now: the asset has a file of that name")
+
+
+def _free_name(folder: Path, name: Path) -> Path:
+    """Return a name, or a similar one if it is taken, or if a file has the name of a folder above it."""
+    taken = next((up for up in reversed(name.parents) if (folder / up).is_file()), name)
+    if taken == name and not (folder / name).exists():
+        return name
+    numbered = (f".mine{'' if number == 1 else f'-{number}'}" for number in itertools.count(1))
+    others = (taken.with_name(f"{taken.stem}{mark}{taken.suffix}") for mark in numbered)
+    return next(other for other in others if not (folder / other).exists()) / name.relative_to(taken)
+
+
+def _move_in(staging: Path, folder: Path, before: Path, say: Say) -> None:
     """Move the old files to `before` and the new ones in, one by one, for folders that cannot be renamed.
 
     The record goes last, so that an interrupted swap is recognized.
     """
     new = sorted(p.relative_to(staging) for p in staging.rglob("*") if p.is_file())
     new.sort(key=lambda name: name == Path(RECORD))
-    for name in [*sorted(Path(old) for old in _ours(folder) - {n.as_posix() for n in new}), *new]:
+    ours = _ours(folder)
+    for name in [*sorted(Path(old) for old in ours - {n.as_posix() for n in new}), *new]:
+        if name.as_posix() not in ours:
+            _make_way(staging, folder, name, say)
         if (folder / name).exists():
             (before / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).replace(before / name)
         if (staging / name).exists():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (staging / name).replace(folder / name)
+
+
+def _make_way(staging: Path, folder: Path, name: Path, say: Say) -> None:
+    """Rename what the user has under the name of a new file, or of a folder above it; equal files may be replaced."""
+    for place in (*reversed(name.parents), name):
+        mine, new = folder / place, staging / place
+        if mine.exists() and not (mine.is_dir() and new.is_dir()) and not _is_equal(mine, new):
+            _set_aside(mine, folder, place, say)
+
+
+def _is_equal(one: Path, other: Path) -> bool:
+    """Return true if both are files with the same content."""
+    return one.is_file() and other.is_file() and filecmp.cmp(one, other, shallow=False)
 
 
 def _foreign(folder: Path) -> list[Path]:

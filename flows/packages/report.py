@@ -21,7 +21,7 @@ from flows.packages.crate import AUTHOR, CRATE, crate_text
 from flows.packages.credentials import Claim, Signer, sidecar_name
 from flows.packages.flow_result import FlowResult, StepRun
 from flows.packages.html_pages import render
-from flows.packages.publish import Files, bytes_digest, publish
+from flows.packages.publish import Files, Say, bytes_digest, publish
 from flows.packages.view import VIEWER, viewer_html
 from steps.contract import RUN_ONLY
 from steps.store.artifact_store import ArtifactStore
@@ -33,13 +33,16 @@ GENERATIVE = (  # steps that generate parts of the asset if they use weights
 UNSIGNED: Mapping[str, Any] = MappingProxyType({})
 
 
-def deliver(job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None) -> None:
+def deliver(
+    job: ConversionJob, result: FlowResult, folder: Path, signer: Signer | None, say: Say = lambda _: None
+) -> None:
     """Put the package of a conversion with reports and record into a folder; see `publish`."""
     store = home.store()
     publish(
         store.path(result.package),
         folder,
         lambda staging, files: finish_package(staging, files, job, result, store, signer),
+        say,
     )
 
 

@@ -13,6 +13,7 @@ import tempfile
 from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
+from urllib.parse import quote
 
 from flows.processes import python, without_prefect
 
@@ -48,6 +49,11 @@ def copy_to(prefect_home: Path) -> None:
         return
     with tempfile.TemporaryDirectory(dir=prefect_home, prefix=".new-") as folder:
         Path(shutil.copyfile(template(), Path(folder) / NAME)).replace(prefect_home / NAME)
+
+
+def address(prefect_home: Path) -> str:
+    """Return the address of the database for Prefect's server, whose own default does not quote the path."""
+    return f"sqlite+aiosqlite:///{quote(str((prefect_home / NAME).absolute()))}"
 
 
 def has_block_types(prefect_home: Path) -> bool:

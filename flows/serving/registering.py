@@ -12,12 +12,14 @@ from prefect.events.schemas.automations import AutomationCore, EventTrigger, Pos
 from prefect.events.schemas.events import ResourceSpecification
 
 from dg4d_lib.errors import BackendUnavailable
-from flows.processes import python
+from flows import home
+from flows.processes import locked, python
 from flows.serving.pools import DEPLOYMENTS, Json, Pool, read_deployments
 from flows.serving.workers import HEARTBEAT_S
 
 MISSED = 3  # heartbeats before a run counts as crashed
 REPORTED_S = 10  # a process worker reports a crash twice within this time
+PATIENCE_S = 300.0  # for another command that registers, which takes about 10 s on an idle machine
 ALIVE = "prefect.flow-run.heartbeat"
 CRASHED = "prefect.flow-run.Crashed"
 ENDINGS = {f"prefect.flow-run.{ending}" for ending in ("Completed", "Failed", "Cancelled")}
@@ -63,14 +65,26 @@ AUTOMATIONS = (
 def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
     """Create pools, their deployments, and the automations that restart crashed runs; return the deployments' names.
 
+    Commands of one user wait for each other: two at a time would create every automation twice.
+
     Args:
         pools: all known pools by name.
         chosen: names of the pools to create.
 
     Raises:
         BadInput: a pool is invalid; nothing was changed.
-        BackendUnavailable: the server rejected the deployments.
+        BackendUnavailable: the server rejected the deployments, or another command has not finished in time.
     """
+    with locked(home.locks() / "register.lock", patience_s=PATIENCE_S) as alone:
+        if not alone:
+            raise BackendUnavailable(
+                f"another `dg4d up` or `dg4d studio` has not registered its deployments within {PATIENCE_S:g} s; end "
+                "it, then run this again"
+            )
+        return _register(pools, chosen)
+
+
+def _register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
     with get_client(sync_client=True) as client:
         workers = {kind: worker for types in client.read_worker_metadata().values() for kind, worker in types.items()}
         defaults = {kind: worker["default_base_job_configuration"] for kind, worker in workers.items()}
@@ -116,11 +130,13 @@ def _deploy(names: list[str]) -> None:
 
 def _automate(client: SyncPrefectClient) -> None:
     for automation in AUTOMATIONS:
-        known = client.find_automation(automation.name)
-        if known is None:
+        known = client.read_automations_by_name(automation.name)
+        for surplus in known[1:]:  # of commands on several machines at the same time
+            client.delete_automation(surplus.id)
+        if not known:
             client.create_automation(automation)
-        elif _content(known) != _content(automation):  # an update resets the runs that a trigger follows
-            client.update_automation(known.id, automation)
+        elif _content(known[0]) != _content(automation):  # an update resets the runs that a trigger follows
+            client.update_automation(known[0].id, automation)
 
 
 def _content(automation: AutomationCore) -> Json:

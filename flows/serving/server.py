@@ -278,6 +278,7 @@ def _serve(listener: socket.socket, folder: Path, prefect_home: Path) -> subproc
         **without_prefect(),
         **SETTINGS,
         "PREFECT_HOME": str(prefect_home),
+        "PREFECT_SERVER_DATABASE_CONNECTION_URL": database_template.address(prefect_home),
         "PREFECT_SERVER_API_AUTH_STRING": auth.auth_string(folder),
         "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": str(not database_template.has_block_types(prefect_home)).lower(),
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port}",

@@ -114,7 +114,9 @@ class Worker:
                     process.wait(LOOK_S)
                     return
         finally:
+            before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it would interrupt the end of the runs
             _end(process)
+            signal.signal(signal.SIGTERM, before)
 
     def _file(self, suffix: str) -> Path:
         return self.folder / f"worker-{self.pool}.{suffix}"

@@ -186,13 +186,23 @@ class Draft:
                 if max(picture.size) > MASK_SIDES:
                     raise BadInput(f"the mask has {picture.size} pixels; its sides have at most {MASK_SIDES}")
                 drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
-        except (OSError, ValueError, SyntaxError) as error:
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise BadInput("the mask is no PNG that can be read; draw it again") from error
         if drawn.getextrema() == (0, 0):
             raise BadInput("the mask is empty: paint over the subject with the brush `keep`")
         png = io.BytesIO()
         drawn.save(png, "PNG")
         write_atomically(self.mask, png.getvalue())
+
+    def drawn_mask(self) -> Path:
+        """Return the file of the matte that the user drew.
+
+        Raises:
+            BadInput: there is none.
+        """
+        if not self.mask.is_file():
+            raise BadInput("there is no mask yet; paint over the subject first")
+        return self.mask
 
     def link(self, key: str, name: str, path: Path) -> Path:
         """Link a file under the name of the asset for one conversion, and return the link.

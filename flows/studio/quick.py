@@ -95,6 +95,7 @@ def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bo
 
     Raises:
         StepError: the file cannot be read, or has no subject.
+        BadInput: a matte is asked for that the user has not drawn.
     """
     upload = draft.first()
     settings = profile(profile_name)
@@ -103,7 +104,7 @@ def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bo
     changes: dict[str, Any] = {"driving.candidates": MOTIONS, "driving.motion": "sway", "subject.size": FILM_SIZE}
     settings = revise(settings, changes | ({"subject.box": list(box)} if box and not masked else {}))
     conversion = Conversion(item=draft.identifier, settings=settings)
-    mask = put_source(draft.mask, home.store()) if masked else None
+    mask = put_source(draft.drawn_mask(), home.store()) if masked else None
     subject = _run("prepare_subject", source=_source(upload), conversion=conversion, mask=mask)
     if "footage" in subject.outputs:
         return []

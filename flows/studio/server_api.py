@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from uuid import UUID
 
 import httpx
 from fastapi import HTTPException
@@ -55,9 +56,13 @@ class ServerApi:
         Raises:
             HTTPException: 404; there is none, or the page did not start it.
         """
-        answer = await self._client.get(f"/flow_runs/{identifier}")
+        nothing = HTTPException(404, "there is no such conversion")
+        try:
+            answer = await self._client.get(f"/flow_runs/{UUID(identifier)}")
+        except ValueError:
+            raise nothing from None
         if answer.status_code != httpx.codes.OK or TAG not in answer.json()["tags"]:
-            raise HTTPException(404, "there is no such conversion")
+            raise nothing
         row: Row = answer.json()
         return row
 

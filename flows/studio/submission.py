@@ -194,9 +194,7 @@ def _mask(draft: Draft, wanted: Submission, first: Upload, key: str) -> str:
         return ""
     if first.kind != "picture":
         raise BadInput("the brush marks the subject of a picture; of a video draw a box, which holds for all frames")
-    if not draft.mask.is_file():
-        raise BadInput("there is no mask yet; paint it and convert again")
-    return str(draft.link(key, "mask.png", draft.mask))
+    return str(draft.link(key, "mask.png", draft.drawn_mask()))
 
 
 def _view(draft: Draft, view: SideView, first: Upload, key: str) -> str:

@@ -125,7 +125,7 @@ def small_webp(
     try:
         with Image.open(file) as picture:
             small = picture.convert("RGBA")
-    except (OSError, ValueError):
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
     for size in sizes:
         small.thumbnail((size, size))

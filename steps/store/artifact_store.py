@@ -19,7 +19,7 @@ from typing import IO, Any, BinaryIO, ClassVar, NamedTuple
 
 from dg4d_lib.errors import BackendUnavailable, DG4DError
 from steps.contract import ArtifactRef, is_digest
-from steps.store.files import room_for, write_atomically
+from steps.store.files import room_for, walk, write_atomically
 
 CHUNK = 1 << 20  # bytes read at a time
 OBJECTS, INCOMING = "sha256", "incoming"
@@ -267,7 +267,7 @@ def object_name(digest: str) -> str:
 
 def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield every regular file under a folder; others may remove files meanwhile."""
-    for path in folder.rglob("*"):
+    for path in walk(folder):
         with suppress(FileNotFoundError):
             status = path.stat()
             if stat.S_ISREG(status.st_mode):

@@ -37,6 +37,7 @@ YES = {"1", "on", "true", "y", "yes"}  # values of $AWS_ALLOW_HTTP, as obstore r
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # between two attempts
 MOST_ATTEMPTS = 10_000  # more than fit into any time limit
 READ_AHEAD = 8 * CHUNK  # bytes per request for a part of an artifact
+RENEW_S = 3600.0  # less than the grace of `dg4d store gc`, by more than clocks of machines differ
 CLOCK = "clock"  # file that is written to read the time of the object store
 
 
@@ -65,11 +66,7 @@ class BucketStore(ArtifactStore):
 
     def has(self, ref: ArtifactRef) -> bool:
         """Return True if the artifact is in the bucket with its full size."""
-        try:
-            with self._answering():
-                return obstore.head(self._bucket, object_name(ref.digest))["size"] == ref.size_bytes
-        except FileNotFoundError:
-            return False
+        return self._modified(ref) is not None
 
     def is_sound(self, ref: ArtifactRef) -> bool:
         """Return True if the artifact is in the bucket with its full size; `get` and `path` check its bytes."""
@@ -150,12 +147,25 @@ class BucketStore(ArtifactStore):
         remove_unused(self.root / OBJECTS, unused_s)
 
     def _keep(self, source: BinaryIO, media_type: str) -> ArtifactRef:
-        """Copy to this machine, which yields the digest, then to the bucket in one upload."""
+        """Copy to this machine, which yields the digest, then to the bucket in one upload.
+
+        An equal object is uploaded again if it is older than `RENEW_S`, as garbage collection goes by the age.
+        """
         ref = super()._keep(source, media_type)
-        if not self.has(ref):
+        modified = self._modified(ref)
+        if modified is None or time.time() - modified > RENEW_S:
             with self._writing():
                 obstore.put(self._bucket, object_name(ref.digest), self._place(ref.digest))
         return ref
+
+    def _modified(self, ref: ArtifactRef) -> float | None:
+        """Return the time of an artifact in the bucket, by its clock; None if it is not there with its full size."""
+        try:
+            with self._answering():
+                found = obstore.head(self._bucket, object_name(ref.digest))
+        except FileNotFoundError:
+            return None
+        return found["last_modified"].timestamp() if found["size"] == ref.size_bytes else None
 
     def _file(self, ref: ArtifactRef) -> Path:
         """Return the copy of an artifact, fetched if it is not here or damaged."""

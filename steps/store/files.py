@@ -74,6 +74,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
                 scratch.unlink(missing_ok=True)
 
 
+def walk(folder: Path) -> Iterator[Path]:
+    """Yield everything below a folder; what others remove meanwhile is left out, which `Path.rglob` does not do."""
+    for place, folders, names in os.walk(folder):
+        yield from (Path(place, name) for name in (*folders, *names))
+
+
 def remove_tree(folder: Path) -> None:
     """Remove a folder that may hold anything, or may be gone already."""
     shutil.rmtree(folder, ignore_errors=True)

@@ -110,6 +110,20 @@ def test_a_worker_that_cannot_write_its_own_files_has_another_place_for_compiled
     assert worker["environment"]["NUMBA_CACHE_DIR"].startswith("/data/")
 
 
+@pytest.mark.parametrize("name", ["worker-cpu", "worker-gpu"])
+def test_a_worker_makes_its_temporary_folder_on_a_disk(name: str, tmp_path: Path) -> None:
+    worker = SERVICES[name]
+    assert worker["environment"]["TMPDIR"].startswith("/data/")
+    assert worker["command"][:2] == ["sh", "-c"]
+    (tmp_path / "prefect").write_text('#!/bin/sh\necho "$@"')
+    (tmp_path / "prefect").chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "TMPDIR": str(tmp_path / "deep" / "tmp")}
+    script = worker["command"][2].replace("$$", "$")
+    done = subprocess.run(["sh", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == f"worker start --pool {name.replace('worker', 'process')} --with-healthcheck\n"
+    assert (tmp_path / "deep" / "tmp").is_dir()
+
+
 def redis_script(place: str) -> str:
     """The shell script that starts Redis, as a shell gets it."""
     if place == "compose":

@@ -86,6 +86,7 @@ def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
         ({"views": {(90, 89): "fox.png"}}, "out of range"),
         ({"views": {math.nan: "fox.png"}}, "out of range"),
         ({"views": {90: "none.png"}}, "none.png"),
+        ({"views": ["fox.png"]}, 'views is a dict of azimuth to file, for example {90: "right.png"}; given list'),
         ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
         ({"asset": "none.glb"}, "none.glb"),
         ({"asset": "fox.glb", "views": {180: "fox.png"}}, "not both"),
@@ -120,7 +121,7 @@ def test_nothing_to_make_and_another_asset_in_the_way_are_refused() -> None:
 )
 def test_a_picture_in_memory_is_taken(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[Any] = []
-    monkeypatch.setattr(making, "_run", lambda job, folder, engine: taken.append(job))
+    monkeypatch.setattr(making, "_run", lambda job, folder, engine, force: taken.append(job))
     monkeypatch.setattr(making, "load", taken.append)
     dg4d.make(given, name="drawn")
     job, folder = taken
@@ -236,8 +237,8 @@ def test_conversions_in_threads_report_to_their_own_callbacks() -> None:
 
 def test_the_engine_of_prefect_connects_and_runs_the_flow(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    monkeypatch.setattr("flows.convert.connect", lambda: calls.append("connect"))
-    monkeypatch.setattr("flows.convert.convert_job", lambda job, folder: calls.append(f"{job.item} in {folder}"))
+    monkeypatch.setattr(making, "connect", lambda: calls.append("connect"))
+    monkeypatch.setattr(making, "convert_job", lambda job, folder, force: calls.append(f"{job.item} in {folder}"))
     monkeypatch.setattr(making, "load", lambda folder: folder)
     dg4d.make(words("fox.png", "1"), engine="prefect")
     assert calls == ["connect", "fox in out/fox"]

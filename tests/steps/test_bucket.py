@@ -13,6 +13,7 @@ from tiny_s3 import BUCKET, TinyS3
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from steps.contract import ArtifactRef
+from steps.store import bucket
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore, StoreUnreachable, object_name
 from steps.store.bucket import BucketStore
 from steps.store.opening import open_store
@@ -244,3 +245,18 @@ def test_without_the_library_folders_are_opened_and_buckets_say_what_to_install(
     assert open_store(tmp_path).root == tmp_path
     with pytest.raises(BackendUnavailable, match="make setup"):
         open_store("s3://no-library/at-all")
+
+
+def test_an_equal_object_is_young_again_when_it_is_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = BucketStore(MemoryStore(), tmp_path / "copies", "memory")
+
+    def put() -> float:
+        time.sleep(0.01)
+        store.put_bytes(b"same", "a/b")
+        (entry,) = store.artifacts()
+        return entry.modified
+
+    first = put()
+    assert put() == first  # not uploaded again
+    monkeypatch.setattr(bucket, "RENEW_S", 0.0)
+    assert put() > first

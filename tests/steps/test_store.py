@@ -1,5 +1,6 @@
 import errno
 import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from steps.contract import ArtifactRef
 from steps.store import artifact_store as module
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
-from steps.store.files import DiskFull, home, make_folders_absolute, write_atomically
+from steps.store.files import DiskFull, home, make_folders_absolute, walk, write_atomically
 
 
 @pytest.fixture
@@ -139,3 +140,14 @@ def test_threads_that_write_one_file_at_once_leave_one_whole_content(tmp_path: P
         list(threads.map(lambda content: write_atomically(tmp_path / "state", content), contents * 4))
     assert (tmp_path / "state").read_text() in contents
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_folder_that_vanishes_while_it_is_listed_is_left_out(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name / "deep").mkdir(parents=True)
+        (tmp_path / name / "deep" / "file").touch()
+    found = walk(tmp_path)
+    first = [next(found), next(found)]
+    assert {path.name for path in first} == {"a", "b"}
+    shutil.rmtree(tmp_path / "b")
+    assert list(found) == [tmp_path / "a" / "deep", tmp_path / "a" / "deep" / "file"]

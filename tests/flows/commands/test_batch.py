@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from prefect.client.orchestration import get_client
 from rich.console import Console
 from waiting import wait_until
 
-from flows import home
+from flows import catalog, home, processes
 from flows.catalog import convert_all
 from flows.catalog_request import CatalogRequest, ready
 from flows.commands.batch import batch, print_summary
@@ -445,3 +446,31 @@ def test_formulas_in_a_summary_are_text_and_numbers_are_numbers(tmp_path: Path) 
     Writer(tmp_path).write([Row(item="<img src=x>", status="failed", message="<b>no</b>")], 1.0)
     page = (tmp_path / "index.html").read_text()
     assert "<img" not in page and "<b>" not in page and "&lt;b&gt;no" in page
+
+
+def test_a_signal_that_is_lost_while_a_catalog_runs_is_sent_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stop(BaseException):
+        """Exception of the handler of the flow."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Stop
+
+    def todo() -> Iterator[Row]:
+        with pytest.raises(Stop):  # stands for a finalizer, which swallows what it raises
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        time.sleep(5)
+        yield Row(item="late", status="done")
+
+    monkeypatch.setattr(processes, "REMINDER_S", 0.05)
+    monkeypatch.setattr(catalog, "Gallery", lambda *_: SimpleNamespace(update=lambda: None))
+    progress = BatchProgress(1)
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        with pytest.raises(Stop):
+            convert_all(todo(), tmp_path, 1, "lost", progress)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not progress.rows

@@ -77,7 +77,12 @@ def test_a_folder_in_which_nothing_may_be_written(place: Path, command: tuple[st
 
 
 def test_a_video_that_is_missing_or_has_one_frame() -> None:
-    refused(dg4d("make", "cat.png", "--video", "run.mp4", "-o", "out"), "run.mp4 does not exist")
+    refused(
+        dg4d("make", "cat.png", "--video", "run.mp4", "-o", "out"), "--video: run.mp4 does not exist; give a video or"
+    )
+    refused(
+        dg4d("make", "cat.png", "--turntable", "run", "-o", "out"), "--turntable: run does not exist; give a video or"
+    )
     Path("run").mkdir()
     Path("run/000.png").write_text(picture("x"))
     refused(dg4d("make", "cat.png", "--video", "run", "-o", "out"), "holds 1 picture")
@@ -254,7 +259,7 @@ def test_a_row_that_breaks_what_nobody_thought_of_fails_alone(place: Path, monke
 
     monkeypatch.setattr("flows.inputs.sources.check_file", broken)
     result = dg4d("batch", ".", "-o", "out")
-    assert (result.exit_code, "cat: failed ZeroDivisionError: oh" in result.output) == (1, True)
+    assert (result.exit_code, "failed: cat: ZeroDivisionError: oh" in result.output) == (1, True)
 
 
 @pytest.mark.parametrize(

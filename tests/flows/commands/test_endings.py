@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import typer
@@ -14,6 +15,7 @@ from flows import processes
 from flows.commands import endings
 from flows.engine.item_runs import ItemFailed
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_HANGUP, EXIT_STATUS, EXIT_TERMINATED
+from flows.home import make_private
 from flows.serving.server import ServerUnavailable
 from flows.step_errors import StepError
 from flows.studio.drafts import TooLarge
@@ -78,6 +80,26 @@ def test_a_read_only_folder_is_told_with_the_variable_that_names_it(
     monkeypatch.setenv("DG4D_STORE", "/here/home/store")
     error = OSError(errno.EROFS, "Read-only file system", path)
     assert endings._describe(error) == (f"Read-only file system: {path}; {advice}", EXIT_BAD_INPUT)
+
+
+@pytest.mark.parametrize(
+    ("home", "state"),
+    [
+        ("file", "is not a folder"),
+        ("file/below", "cannot be created (Not a directory)"),
+        ("/proc/x", "cannot be created"),
+    ],
+)
+def test_a_home_that_is_no_folder_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str, state: str
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path / home))
+    with pytest.raises(OSError, match="Errno") as raised:
+        make_private(tmp_path / home)
+    text, status = endings._describe(raised.value)
+    assert text.startswith(f"$DG4D_HOME {state}") and f": {tmp_path / home}; name a folder" in text
+    assert status == EXIT_BAD_INPUT
 
 
 def of_ours(kind: type[Exception]) -> set[type[Exception]]:

@@ -71,6 +71,12 @@ def test_motions_have_a_header_and_say_how_to_use_one(dg4d: Run) -> None:
     assert lines[-1].endswith(": dg4d make --pick 1 fox.png")
 
 
+def test_motions_of_a_video_are_refused_before_any_step(dg4d: Run, log: Path) -> None:
+    done = dg4d("motions", words("walk.mp4", "1"))
+    assert done.exit_code == 65 and "walk.mp4 is a video; give a picture" in done.stderr
+    assert ran(log) == []
+
+
 def test_the_command_after_motions_makes_the_motion_that_was_shown(dg4d: Run) -> None:
     Image.new("L", (8, 6), 255).save("my mask.png")
     options = ["--set", "driving.motion=bend", "--set", "driving.fps=9", "--profile", "video-fast", "--seed", "7",

@@ -27,7 +27,7 @@ from steps.store.artifact_store import ArtifactStore
 
 TINY = {
     "subject.size": 64,
-    "driving.frames": 2,
+    "driving.frames": 3,
     "prior.kind": "geometric",
     "prior.size": 48,
     "static.iterations": 2,

@@ -46,7 +46,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     *deployments, address = said.stdout.splitlines()
     assert deployments == [
         "picture-to-4d/Picture to 4D", "video-to-4d/Video to 4D", "model-to-4d/Model to 4D", "benchmark/Benchmark",
-        "catalog-to-4d/Catalog to 4D", "item-to-4d/Item to 4D",
+        "catalog-to-4d/Catalog to 4D",
     ]  # fmt: skip
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
     explained = said.stderr.splitlines()

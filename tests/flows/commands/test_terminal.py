@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from flows.commands.batch import print_summary
 from flows.commands.terminal import (
     BatchTable,
     StepBars,
@@ -16,6 +17,7 @@ from flows.commands.terminal import (
     steps_shown,
 )
 from flows.engine.events import StepEvent, emit
+from flows.packages.summary import Row
 
 EVENT = StepEvent("newt", "fit_gaussians", "progress", done=114, total=250, values={"loss": 9.437, "reference": 12.57})
 
@@ -47,6 +49,14 @@ def test_what_the_library_has_to_say_is_shown():
         with steps_shown(Console(file=screen, width=100, force_terminal=interactive, color_system=None)):
             emit(note)
         assert "compiling kernels" in screen.getvalue()
+
+
+def test_the_error_of_an_item_of_a_batch_is_printed_once(tmp_path: Path) -> None:
+    screen = io.StringIO()
+    out, row = Console(file=screen, soft_wrap=True), Row(item="fox", status="failed", message="row 1: no subject")
+    BatchTable(["fox"]).show(row, out)
+    print_summary([row], tmp_path, out)
+    assert screen.getvalue().splitlines()[:2] == ["fox: failed", "failed: fox: row 1: no subject"]
 
 
 def test_rows_stand_in_columns_and_words_in_brackets_stay():

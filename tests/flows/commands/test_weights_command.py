@@ -16,6 +16,7 @@ from dg4d_lib.weights.locate import digests
 from dg4d_lib.weights.lock import LockedFile, LockEntry, read_lock, write_lock
 from dg4d_lib.weights.registry import KNOWN
 from flows import cli
+from flows.inputs.conversion_job import ConversionRequest
 from steps.profiles import PROFILES
 
 LGM = "model_fp16_fixrot.safetensors"
@@ -56,7 +57,7 @@ def test_the_list_names_all_weights_their_licenses_and_what_is_here(home: Path) 
         assert line_of(name, before.stdout).split()[1] == "no"
         folded = "".join(before.stdout.split())
         assert weights.hub_id in folded
-        assert "".join(weights.license.name.split()) in folded
+        assert "".join(str(weights.license).split()) in folded  # conditions of commercial use, too
     file = pulled(home)
     listing = dg4d("weights", "list").stdout
     assert line_of("lgm", listing).split()[1:4] == ["yes", "0.00", "c0ffee0000"]
@@ -198,6 +199,19 @@ def test_pull_wants_names() -> None:
     result = dg4d("weights", "pull", "./folder")
     assert result.exit_code == 65
     assert "is a folder on this machine" in result.stderr
+
+
+def test_make_tells_the_conditions_of_commercial_use(home: Path) -> None:
+    request = ConversionRequest(item="fox", picture=Path("fox.png"), settings=PROFILES["paper"])
+    assert request.license_conditions() == [f"license of svd: {KNOWN['svd'].license}"]
+    assert "one million US dollars" in request.license_conditions()[0]
+
+
+def test_a_folder_of_weights_that_is_a_file_is_refused(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("file").touch()
+    monkeypatch.setenv("DG4D_WEIGHTS", "file")
+    done = dg4d("weights", "list")
+    assert done.exit_code == 65 and f"$DG4D_WEIGHTS is not a folder: {Path('file').absolute()}" in done.stderr
 
 
 def test_make_refuses_weights_that_forbid_commercial_use_before_it_looks_for_them(home: Path) -> None:

@@ -7,6 +7,7 @@ import ssl
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from fake_steps import PNG
 
 from dg4d_lib.errors import BadInput
 from flows.inputs import fetching, hosts
-from flows.inputs.fetching import local_copy
+from flows.inputs.fetching import item_name, local_copy
 
 
 class Site:
@@ -346,3 +347,40 @@ def test_certificates_are_checked_against_the_name(tmp_path: Path, monkeypatch: 
     finally:
         site.server.shutdown()
         site.server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("address", "name"),
+    [
+        ("in/bear #2.png", "bear #2"),
+        ("in/what?.png", "what?"),
+        ("in/100%25.png", "100%25"),
+        ("s3://bucket/in/bear #2.png", "bear #2"),
+        ("s3://bucket/in/a%20fox.png", "a%20fox"),
+        ("https://host/in/a%20fox.png?key=1#top", "a fox"),
+        ("https://host/", "asset"),
+    ],
+)
+def test_a_number_sign_or_question_mark_is_part_of_the_name_of_a_file_and_not_of_a_page(
+    address: str, name: str
+) -> None:
+    assert item_name(address) == name
+
+
+def test_a_folder_of_frames_keeps_its_dots(tmp_path: Path) -> None:
+    (tmp_path / "walk.v2").mkdir()
+    assert item_name(str(tmp_path / "walk.v2")) == "walk.v2"
+
+
+def test_an_object_with_a_number_sign_in_its_key_is_fetched_under_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    @contextmanager
+    def fetch(*of: str) -> Iterator[Path]:
+        asked.append(of)
+        yield Path(of[2])
+
+    monkeypatch.setattr("flows.inputs.listing.fetch_object", fetch)
+    with local_copy("s3://bucket/in/bear #2.png") as path:
+        assert path.name == "bear #2.png"
+    assert asked == [("s3://bucket/in", "bear #2.png", "bear #2.png")]

@@ -1,6 +1,7 @@
 """Reference of settings: complete, true, and a help for misspelt names."""
 
 import json
+import re
 
 import pytest
 
@@ -30,6 +31,30 @@ def test_every_setting_can_be_set_to_its_default(one: Setting) -> None:
     choice, _, kind = one.only_with.partition("=")
     settings = revise(PipelineSettings(), {choice: kind} if choice else {})
     assert revise(settings, {one.name: json.loads(one.default)}) == settings
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_setting_of_another_kind_is_refused_with_its_kind(name: str) -> None:
+    """No name of docs/settings.md is unknown, in any profile."""
+    for one in SETTINGS:
+        choice = one.only_with.partition("=")[0]
+        try:
+            revise(profile(name), {one.name: json.loads(one.default)})
+        except BadInput as error:
+            other = rf"{re.escape(one.name)} exists with \S+\.kind=.*; \S+\.kind is \w+\. Add `--set \S+\.kind=\w+`\."
+            refused = choice and str(error).startswith("settings refused: ")  # the default of another kind
+            assert re.fullmatch(other, str(error)) or refused, error
+
+
+def test_the_kinds_that_have_a_setting_are_named() -> None:
+    with pytest.raises(BadInput, match=r"driving\.height exists with driving\.kind=svd or diffusers; .* is warp\. Add"):
+        revise(profile("preview"), {"driving.height": 512})
+    with pytest.raises(
+        BadInput, match=r"prior\.variant exists with refiner\.kind=image_to_image; refiner\.kind is ident"
+    ):
+        revise(profile("preview"), {"refiner.prior.variant": "xl"})
+    with pytest.raises(BadInput, match=r"unknown setting 'static\.start\.kind\.name'"):
+        revise(profile("preview"), {"static.start.kind.name": 1})
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -61,6 +61,34 @@ def test_a_new_package_replaces_the_old_and_keeps_files_of_the_user(package: Pat
     assert is_current(out, "o1")
 
 
+@pytest.mark.parametrize("in_place", [False, True], ids=["renamed", "in place"])
+def test_a_file_of_the_user_is_kept_when_a_later_package_brings_one_of_its_name(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_place: bool
+) -> None:
+    out, said = tmp_path / "out", list[str]()
+    publish(package, out, finish)
+    for name in ("asset_rigged.glb", "asset_rigged.mine.glb", "same.glb", "meshes"):
+        (out / name).write_text(f"{name} of hours of work")
+    (out / "same.glb").write_text("equal")
+    (out / "sheet.png").mkdir()
+    (out / "sheet.png" / "own.txt").write_text("a folder")
+    if in_place:
+        monkeypatch.chdir(out)
+    new = {"asset_rigged": "new", "same": "equal", "meshes__000": "mesh"}
+    entries = {f"{name}_dot_glb": content for name, content in new.items()}
+    archive = zipped(tmp_path / "other.zip", **entries, sheet_dot_png="sheet")
+    publish(archive, out, finish, said.append)
+    assert set(tree(out)) == {
+        "asset_rigged.glb", "same.glb", "meshes/000.glb", "sheet.png", "provenance.json", "report.html",
+        "asset_rigged.mine.glb", "asset_rigged.mine-2.glb", "meshes.mine", "sheet.mine.png/own.txt",
+    }  # fmt: skip
+    assert tree(out)["asset_rigged.glb"] == "new"
+    kept = {tree(out)["asset_rigged.mine.glb"], tree(out)["asset_rigged.mine-2.glb"]}
+    assert kept == {"asset_rigged.glb of hours of work", "asset_rigged.mine.glb of hours of work"}
+    assert len(said) == 3 and all("your own file" in text for text in said)
+    assert is_current(out, "o1")
+
+
 def test_a_package_without_its_report_is_not_current(package: Path, tmp_path: Path) -> None:
     publish(package, tmp_path / "out", finish)
     (tmp_path / "out" / "report.html").unlink()

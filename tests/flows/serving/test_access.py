@@ -1,6 +1,7 @@
 """Access to the background server: the secret, hosts, origins, cookies, and permissions of files."""
 
 import http.client
+import json
 import stat
 import threading
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from flows.serving.auth import SESSION_S, Sessions, auth_string, basic, is_autho
 from flows.serving.server import Server
 from steps.contract import ArtifactRef
 from steps.store.artifact_store import ArtifactStore
+from tests.clients.node import run_node
 
 PNG = b"\x89PNG\r\n\x1a\n"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
@@ -188,6 +190,18 @@ def test_a_browser_that_is_not_signed_in_is_sent_to_the_page_that_signs_in(
     assert headers["x-frame-options"] == "DENY"
     assert server.auth_string() not in page.decode()
     assert server.login_address("http://h:1") == f"http://h:1/dg4d/login#{server.auth_string()}"
+
+
+@pytest.mark.parametrize(
+    ("given", "status", "kept", "left"),
+    [("dg4d:new", 204, "new", True), ("dg4d:wrong", 401, "old", False), ("dg4d:new", 503, "old", False),
+     ("", 204, "old", True), ("", 401, "", False)],
+)  # fmt: skip
+def test_a_browser_keeps_a_secret_that_the_server_accepted(given: str, status: int, kept: str, left: bool) -> None:
+    page = Path(access.__file__).with_name("login.html")
+    word = {name: basic(f"dg4d:{name}").removeprefix("Basic ") for name in ("old", "new")} | {"": ""}
+    asked = {"page": str(page), "hash": f"#{given}" if given else "", "kept": word["old"], "status": status}
+    assert run_node("login.mjs", json.dumps(asked)) == {"kept": word[kept], "left": left}
 
 
 def test_further_hosts_are_named_by_the_environment_and_never_all(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import pytest
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from prefect.server.database import orm_models
+from sqlalchemy.engine import make_url
 
 from flows.serving import database_template
 
@@ -58,3 +59,9 @@ def test_a_copy_has_all_block_types_and_a_database_of_earlier_days_may_not(
     assert not database_template.has_block_types(tmp_path)
     monkeypatch.setattr(database_template, "template", lambda: tmp_path / "missing.db")
     assert not database_template.has_block_types(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["plain", "what?", "100%41", "a b#c$d"])
+def test_the_database_lies_in_the_home_folder_whatever_its_name(tmp_path: Path, name: str) -> None:
+    address = make_url(database_template.address(tmp_path / name))
+    assert (address.drivername, address.database) == ("sqlite+aiosqlite", str(tmp_path / name / "prefect.db"))

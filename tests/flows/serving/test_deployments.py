@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import time
 import urllib.error
 import urllib.request
@@ -13,7 +14,9 @@ from conversions import Run
 from fake_steps import picture
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterParentFlowRunId
-from prefect.exceptions import PrefectHTTPStatusError
+from prefect.exceptions import PrefectHTTPStatusError, TerminationSignal
+from prefect.flow_engine import run_flow
+from prefect.states import Cancelling, Pending
 from pydantic import ValidationError
 from tiny_s3 import TinyS3
 from waiting import wait_until
@@ -21,6 +24,7 @@ from waiting import wait_until
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.input_settings import WarpSettings
 from flows import deployments
+from flows.engine.cancellation import stay_cancelled
 from flows.packages.publish import load_verified
 from flows.serving import registering, watching
 from flows.serving.pools import read_pools
@@ -118,6 +122,30 @@ def test_registering_again_changes_nothing(client: SyncPrefectClient) -> None:
     assert registering.register(read_pools(), ["process-cpu"]) == [f"{flow}/{name}" for flow, name in NAMES.items()]
     assert there() == before
     assert {automation.name for automation in registering.AUTOMATIONS} <= set(before[1])
+
+
+def test_automations_that_two_commands_made_twice_are_one_again(client: SyncPrefectClient) -> None:
+    one = registering.AUTOMATIONS[0]
+    client.create_automation(one)
+    assert len(client.read_automations_by_name(one.name)) == 2
+    registering._automate(client)
+    assert len(client.read_automations_by_name(one.name)) == 1
+
+
+def test_commands_register_one_after_the_other(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    monkeypatch.setattr(registering, "PATIENCE_S", 0.0)
+    begun: list[str] = []
+
+    def register(pools: object, chosen: list[str]) -> list[str]:
+        begun.append("first")
+        with pytest.raises(BackendUnavailable, match="another `dg4d up`"):
+            registering.register({}, [])
+        return chosen
+
+    monkeypatch.setattr(registering, "_register", register)
+    assert registering.register({}, ["pool"]) == ["pool"]
+    assert begun == ["first"]
 
 
 @pytest.mark.slow
@@ -240,6 +268,35 @@ def test_a_worker_knows_how_many_runs_would_end_with_it(
     wait_until(lambda: counted.runs() == 1)
     wait_until(lambda: ended(client, parameters["out"]))
     wait_until(lambda: counted.runs() == 0)
+
+
+@pytest.mark.parametrize(("asked", "left"), [(True, "CANCELLED"), (False, "CRASHED")])
+def test_a_run_that_a_signal_ends_is_cancelled_if_its_end_was_asked_for(
+    client: SyncPrefectClient, monkeypatch: pytest.MonkeyPatch, asked: bool, left: str
+) -> None:
+    deployment = client.read_deployment_by_name(f"picture-to-4d/{NAMES['picture-to-4d']}")
+    given = {"picture": "in.png", "out": "out"}
+    run = client.create_flow_run_from_deployment(deployment.id, parameters=given, state=Pending())
+
+    def end() -> None:
+        if asked:
+            client.set_flow_run_state(run.id, Cancelling(message="by a person"), force=True)
+        raise TerminationSignal(signal.SIGTERM)
+
+    monkeypatch.setattr(deployments, "_start", end)
+    before = signal.signal(signal.SIGTERM, lambda *_: None)  # Prefect sends the signal again after the flow
+    try:
+        with pytest.raises(TerminationSignal):
+            run_flow(deployments.picture_to_4d, run, given)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    state = client.read_flow_run(run.id).state
+    assert state is not None and state.type.name == left
+
+
+def test_every_deployment_keeps_a_cancelled_run_cancelled() -> None:
+    for name in NAMES:
+        assert stay_cancelled in getattr(deployments, name.replace("-", "_")).on_crashed_hooks
 
 
 def test_a_run_that_was_begun_too_often_fails(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,7 +137,7 @@ def test_model_mask_and_box_of_a_form_reach_the_job(place: Path, monkeypatch: py
     (place / "in" / "fox.glb").write_bytes(b"glTF same")
     jobs: list[ConversionJob] = []
     monkeypatch.setattr(deployments, "connect", lambda: None)
-    monkeypatch.setattr(deployments, "convert_job", lambda job, folder: jobs.append(job))
+    monkeypatch.setattr(deployments, "convert_job", lambda job, folder, force: jobs.append(job))
     sides, cutout = Sides(asset=str(place / "in" / "fox.glb")), Cutout(mask=inside, box="1,2,30,40")
     deployments.picture_to_4d.fn(inside, str(place / "in" / "out"), sides=sides, cutout=cutout)
     (job,) = jobs
@@ -149,7 +149,7 @@ def test_depth_of_a_form_reaches_the_job(place: Path, monkeypatch: pytest.Monkey
     inside = str(place / "in" / "fox.png")
     jobs: list[ConversionJob] = []
     monkeypatch.setattr(deployments, "connect", lambda: None)
-    monkeypatch.setattr(deployments, "convert_job", lambda job, folder: jobs.append(job))
+    monkeypatch.setattr(deployments, "convert_job", lambda job, folder, force: jobs.append(job))
     for form in (Cutout(depth=inside), Cutout(layers=inside)):
         deployments.picture_to_4d.fn(inside, str(place / "in" / "out"), cutout=form)
     assert [(job.depth == job.source, job.layers == job.source) for job in jobs] == [(True, False), (False, True)]

@@ -70,7 +70,8 @@ def test_the_page_runs_its_own_script_alone_and_is_not_framed(studio: Client) ->
 
 
 @pytest.mark.parametrize("path", ["/drafts/../x", "/drafts/0123", "/drafts/0123456789abcdef", f"/runs/{UNKNOWN}",
-                                  f"/runs/{UNKNOWN}/status", "/runs/x", "/assets/asset-none-000000",
+                                  f"/runs/{UNKNOWN}/status", "/runs/x", "/runs/%00", "/runs/%0d%0a",
+                                  "/assets/asset-none-000000",
                                   "/static/..%2froutes.py", "/static/routes.py",
                                   f"/thumbnails/{'0' * 64}/7", "/entries/zz/7/x",
                                   f"/entries/{'0' * 64}/7/x"])  # fmt: skip

@@ -1,6 +1,8 @@
 """Conversions that the studio starts, without a server."""
 
 import asyncio
+import struct
+import zlib
 from collections.abc import AsyncIterator
 from io import BytesIO
 from pathlib import Path
@@ -10,15 +12,17 @@ import pytest
 from fake_steps import PNG
 from PIL import Image
 
+from dg4d_lib.errors import BadInput
 from flows import home
+from flows.inputs.fetching import item_name
 from flows.inputs.manifest import items_of
-from flows.inputs.naming import name_from_path
 from flows.serving.roots import Roots
 from flows.studio import quick
 from flows.studio.drafts import Draft, Upload
 from flows.studio.pages import DESCRIPTIONS
 from flows.studio.status import name_of
-from flows.studio.submission import Submission, convert
+from flows.studio.submission import Submission, asset_tag, convert
+from flows.ui import pages
 from steps.profiles import PROFILES
 
 
@@ -59,12 +63,14 @@ def test_a_batch_makes_an_asset_of_every_file_whatever_its_suffix(draft: Draft) 
         item.request.check()
 
 
+@pytest.mark.parametrize("name", ["Fox 1.5", "bear #2", "what? 100%"])
 @pytest.mark.parametrize("file", ["fox.png", "picture", "Fox 1.5"])
-def test_a_name_with_dots_stays_whole(draft: Draft, file: str) -> None:
+def test_a_name_with_dots_and_signs_stays_whole_and_its_page_is_found(draft: Draft, file: str, name: str) -> None:
     receive(draft, file, PNG)
-    run = convert(draft, Submission(name="Fox 1.5"))
+    run = convert(draft, Submission(name=name))
     row = {"name": run.name, "parameters": run.parameters}
-    assert name_of(row) == name_from_path(Path(run.parameters["picture"])) == "Fox 1.5"
+    assert name_of(row) == item_name(run.parameters["picture"]) == name
+    assert asset_tag(item_name(run.parameters["picture"])) in run.tags
 
 
 @pytest.mark.parametrize(("frames", "kind"), [(1, "picture"), (2, "video")])
@@ -77,3 +83,22 @@ def test_a_file_that_was_removed_from_the_store_is_stored_again(draft: Draft) ->
     stored = quick._source(upload)
     home.store().path(stored).unlink()
     assert quick._source(upload) == stored and home.store().has(stored)
+
+
+def test_a_mask_that_claims_to_be_huge_is_refused(draft: Draft) -> None:
+    with pytest.raises(BadInput, match="no PNG that can be read"):
+        draft.save_mask(huge_png(), (8, 8))
+    assert pages.small_webp(BytesIO(huge_png()), 10_000) is None
+
+
+def test_a_mask_that_was_not_drawn_is_asked_for(draft: Draft) -> None:
+    receive(draft, "fox.png", PNG)
+    for ask in (lambda: quick.films(draft, "preview", masked=True), lambda: convert(draft, Submission(masked=True))):
+        with pytest.raises(BadInput, match="no mask yet; paint"):
+            ask()
+
+
+def huge_png() -> bytes:
+    """Return the head of a picture of 60000 times 60000 pixels."""
+    head = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", len(head) - 4) + head + struct.pack(">I", zlib.crc32(head))
