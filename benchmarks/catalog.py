@@ -48,7 +48,7 @@ from flows.tasks import drive_video, prepare_subject
 
 DATABASES = ("sqlite", "postgresql")
 STEPS = ("prepare_subject", "drive_video")
-KNOBS = {"subject.size": 32, "driving.frames": 2}
+KNOBS = {"subject.size": 32, "driving.frames": 3}
 SETTLE_S = 120.0  # the server writes events in batches
 START_S = 600.0  # generous, for busy machines
 

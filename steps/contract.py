@@ -36,6 +36,8 @@ RUN_ONLY = frozenset(  # fields of a record that its digest leaves out
     ["started", "duration_s", "cpu_s", "peak_memory_mb", "flops", "run_notes", "machine"]
 )
 
+NO_LIST = {"list_type", "tuple_type"}  # errors of pydantic
+
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
 
@@ -174,7 +176,12 @@ def settings_errors(error: ValidationError, given: Any = None) -> str:
     lines = []
     for each in error.errors():
         name = _setting_name(each["loc"], given)  # empty if all settings together are refused
-        lines.append(f"{name} = {quoted(each['input'])}: {each['msg']}" if name else each["msg"])
+        value, message = each["input"], each["msg"].removeprefix("Value error, ")
+        if name and each["type"] in NO_LIST:
+            items = value if isinstance(value, int | float | str) else "..."
+            lines.append(f"{name} = {quoted(value)} is not a list; write for example `--set '{name}=[{items}]'`")
+        else:
+            lines.append(f"{name} = {quoted(value)}: {message}" if name else message)
     return "; ".join(lines)
 
 

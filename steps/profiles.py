@@ -1,9 +1,10 @@
 """Settings of the pipeline and of its steps, named profiles, and changes by dotted keys."""
 
 import functools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from operator import attrgetter
-from typing import Annotated, Any, Literal, Self
+from types import UnionType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
 
@@ -244,6 +245,9 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         branch: Any = tree
         for i, name in enumerate([*path, last]):
             if not isinstance(branch, dict) or name not in branch:
+                section, rest = key.split(".")[:i], key.split(".")[i:]
+                if kinds := _kinds_with(section, rest):
+                    raise BadInput(_other_kind(key, ".".join(section), kinds, branch["kind"]))
                 known = ", ".join(sorted(branch)) if isinstance(branch, dict) else "nothing: it is a value"
                 raise BadInput(f"unknown setting {key!r}: {'.'.join(key.split('.')[:i]) or 'the pipeline'} has {known}")
             if i < len(path):
@@ -256,6 +260,40 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
         raise BadInput(f"settings refused: {settings_errors(error, tree)}") from error
+
+
+def _kinds_with(section: Sequence[str], rest: Sequence[str]) -> list[str]:
+    """Return the kinds of a section that have a setting, given by the rest of its name; [] if it has no kinds."""
+    owners: list[type[Settings]] = [PipelineSettings]
+    for name in section:
+        owners = [below for owner in owners for below in _classes_of(owner, name)]
+    return [
+        owner.model_fields["kind"].default for owner in owners if "kind" in owner.model_fields and _has(owner, rest)
+    ]
+
+
+def _has(owner: type[Settings], names: Sequence[str]) -> bool:
+    """Return true if settings of a class have a field of this name, for some choice of the kinds below."""
+    first, *rest = names
+    if not rest:
+        return first in owner.model_fields
+    return any(_has(below, rest) for below in _classes_of(owner, first))
+
+
+def _classes_of(owner: type[Settings], name: str) -> list[type[Settings]]:
+    """Return the settings class of a field, or those of its kinds; [] if it is a value or does not exist."""
+    if name not in owner.model_fields:
+        return []
+    annotation = owner.model_fields[name].annotation
+    choices = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    return [one for one in choices if isinstance(one, type) and issubclass(one, Settings)]
+
+
+def _other_kind(key: str, section: str, kinds: list[str], chosen: str) -> str:
+    names = " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
+    return (
+        f"{key} exists with {section}.kind={names}; {section}.kind is {chosen}. Add `--set {section}.kind={kinds[0]}`."
+    )
 
 
 def _renamed(old: str, new: str) -> str:

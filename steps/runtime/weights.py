@@ -45,9 +45,18 @@ class LocatedWeights:
 
 
 def weights_home() -> Path:
-    """Return the folder of all weights: `$DG4D_WEIGHTS`, else `weights` under the home folder."""
+    """Return the folder of all weights: `$DG4D_WEIGHTS`, else `weights` under the home folder.
+
+    Raises:
+        BadInput: `$DG4D_WEIGHTS` names a file.
+    """
     given = os.environ.get("DG4D_WEIGHTS")
-    return Path(given).expanduser().absolute() if given else home() / "weights"
+    if not given:
+        return home() / "weights"
+    folder = Path(given).expanduser().absolute()
+    if folder.is_file():
+        raise BadInput(f"$DG4D_WEIGHTS is not a folder: {folder}; name the folder of the weights")
+    return folder
 
 
 def open_weights(name: str) -> LocatedWeights:

@@ -127,11 +127,22 @@ def test_every_setting_in_a_document_can_be_set(path: str) -> None:
         revise(profile("preview"), parse_changes([pair]))
 
 
+def test_the_settings_of_the_models_of_open_can_be_set() -> None:
+    table = repository.text("docs/gpu.md").split("\n## The profile open\n")[1].split("\n- `generate_views`")[0]
+    rows = [
+        re.findall(r"`([\w.]+)=([^`]+)`", line.split("|")[-2]) for line in table.splitlines() if line.startswith("|")
+    ]
+    assert sum(map(bool, rows)) == 3
+    for row in rows:
+        revise(profile("open"), parse_changes([f"{name}={value}" for name, value in row]))
+
+
 def test_the_examples_of_data_formats_are_valid() -> None:
     page = repository.text("docs/data.md")
     items = Scene.model_validate_json(repository.fenced(page, "## Scene")).items
     default = SceneItem(package="demo").model_dump()
     assert items[0].model_dump() == default
+    assert "and `duration_s`" in page and Scene(items=items).duration_s is None
     assert len(BankIndex.model_validate_json(repository.fenced(page, "## View bank")).views) == 2
 
 
@@ -179,8 +190,10 @@ def test_every_file_of_a_package_is_explained() -> None:
 def test_every_environment_variable_is_explained() -> None:
     name = re.compile(r"\bDG4D_[A-Z0-9_]*[A-Z0-9](?![A-Z0-9_])")
     code = "".join(repository.text(path) for path in repository.modules(*repository.PACKAGES, "integrations", "tests"))
+    deployed = "".join(repository.text(path) for path in repository.files() if path.startswith("deploy/"))
     documents = "".join(repository.text(path) for path in DOCUMENTS)
-    assert set(name.findall(code)) == set(name.findall(documents))
+    assert set(name.findall(code + deployed)) == set(name.findall(documents))
+    assert set(name.findall(deployed)) <= set(name.findall(repository.text("docs/environment.md")))
 
 
 @pytest.mark.parametrize("path", DOCUMENTS)

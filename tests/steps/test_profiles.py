@@ -29,6 +29,24 @@ def test_a_refused_setting_has_its_own_name(name: str) -> None:
         revise(PREVIEW, {**kinds, name: "walk"})
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("pack.lods", 0.5, "0.5 is not a list; write for example `--set 'pack.lods=[0.5]'`"),
+        ("subject.box", "1,2,3", "'1,2,3' is not a list; write for example `--set 'subject.box=[1,2,3]'`"),
+        (
+            "deformation.scales",
+            {"a": 1},
+            "{'a': 1} is not a list; write for example `--set 'deformation.scales=[...]'`",
+        ),
+        ("subject.box", [1, 2, 3], "[1, 2, 3]: a box is X,Y,W,H in pixels"),
+    ],
+)
+def test_a_refused_list_is_told_how_it_is_written(name: str, value: object, message: str) -> None:
+    with pytest.raises(BadInput, match=re.escape(f"refused: {name} = {message}")):
+        revise(PREVIEW, {name: value})
+
+
 PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.98, "static.t_max_end": 0.02,
          "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
          "static.t_max_limit": 0.98, "motion.t_max_limit": 0.98, "motion.guidance_weight": 1.0,
@@ -94,7 +112,7 @@ def test_open_names_weights_that_may_be_sold_and_no_others() -> None:
 def test_a_flow_matching_model_is_no_critic(changes: dict[str, str], owner: str) -> None:
     with pytest.raises(
         BadInput,
-        match=rf"refused: Value error, {re.escape(owner)} = .* is a flow-matching model: it .*zero123-xl",
+        match=rf"refused: {re.escape(owner)} = .* is a flow-matching model: it .*zero123-xl",
     ):
         revise(PREVIEW, changes)
 
