@@ -6,6 +6,8 @@ from pydantic import Field, field_validator
 
 from dg4d_lib.settings import NotNegative, Positive, Settings, Share
 
+SMALLEST_HEIGHT_M = 1e-6  # meters; far below, scales leave the range of 32-bit floating-point numbers
+
 
 class GltfSettings(Settings):
     """Options of GLB files (ours); readers need glTF 2.0 with KHR_mesh_quantization, or without it if not quantized."""
@@ -115,7 +117,7 @@ class PackSettings(Settings):
         0.0,
         ge=0,
         le=1000,
-        description="height of the first frame, meters; 0: one meter per unit of the fit, about 1.5 m",
+        description="height of the first frame, meters, from 0.000001; 0: one meter per unit of the fit, about 1.5 m",
     )
     ground: bool = Field(
         True,
@@ -169,6 +171,13 @@ class PackSettings(Settings):
             raise ValueError("use 0 for the frame rate of the driving video, or 1 to 240")
         return fps
 
+    @field_validator("height_m")
+    @classmethod
+    def _check_height(cls, height_m: float) -> float:
+        if 0 < height_m < SMALLEST_HEIGHT_M:
+            raise ValueError(f"use 0 for one meter per unit of the fit, or {SMALLEST_HEIGHT_M} to 1000")
+        return height_m
+
 
 class AssetSettings(Settings):
     """A model of the user's own (`--asset`): its placement, and the fit of its motion; ours."""
@@ -189,7 +198,13 @@ class AssetSettings(Settings):
         description="where the first frame shows a skinned model in another pose than at rest, its joints are turned "
         "to that pose and move it; false: its surface bends",
     )
-    nodes: int = Field(200, ge=4, le=2000, description="number of control nodes on the surface")
+    nodes: int = Field(
+        200,
+        ge=4,
+        le=1000,
+        description="number of control nodes on the surface, at most one per vertex; with 1000, tracking solves for "
+        "6000 unknowns a step",
+    )
     size: int = Field(128, ge=32, le=512, multiple_of=16, description="pixels of the compared pictures")
     tracking: Literal["flow", "descent"] = Field(
         "flow",
@@ -204,7 +219,7 @@ class AssetSettings(Settings):
     lr: Positive = Field(
         0.003, description="learning rate of the position of the model, world units; for `tracking=descent`, 0.006"
     )
-    smoothing: NotNegative = Field(1.0, description="smoothing of the steps over the control graph")
+    smoothing: float = Field(1.0, ge=0, le=1000, description="smoothing of the steps over the control graph")
     color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
     alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
     flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")

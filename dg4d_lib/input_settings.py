@@ -98,8 +98,10 @@ class WarpSettings(Settings):
     pick: Pick = 0
     motion: Motion = Field("sway", description="weights-free motion, ours; further candidates use the other motions")
     strength: float = Field(1.0, gt=0, le=3, description="factor on the motion's amplitude")
-    frames: int = Field(14, ge=2, le=128, description="frames of a generated video (paper: 14)")
-    fps: float = Field(7.0, gt=0, le=120, description="frames per second of a generated video (paper: 7)")
+    frames: int = Field(
+        14, ge=3, le=128, description="frames of a generated video (paper: 14); most motions are at rest at half a loop"
+    )
+    fps: float = Field(7.0, ge=0.01, le=120, description="frames per second of a generated video (paper: 7)")
 
 
 class SvdSettings(Settings):
@@ -110,7 +112,7 @@ class SvdSettings(Settings):
     pick: Pick = 0
     model: VideoModelSettings = VideoModelSettings()
     frames: int = Field(14, ge=2, le=64, description="frames of the video; svd was trained on 14, svd-xt on 25")
-    fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback (paper: 7)")
+    fps: float = Field(7.0, ge=0.01, le=120, description="frames per second of playback (paper: 7)")
     height: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 576)")
     width: int = Field(512, ge=64, le=2048, multiple_of=64, description="pixels (public code: 512; trained on 1024)")
 
@@ -147,7 +149,7 @@ class DiffusersVideoSettings(Settings):
         description="frames that the pipeline generates, rounded up to a number that it can; `frames` of them, evenly "
         "spaced, are kept; 0: as many as are kept",
     )
-    fps: float = Field(7.0, gt=0, le=120, description="frames per second of playback")
+    fps: float = Field(7.0, ge=0.01, le=120, description="frames per second of playback")
     height: int = Field(
         512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes"
     )

@@ -424,7 +424,9 @@ class MeshSettings(Settings):
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
     density_threshold: Positive = Field(0.5, description="first isosurface level that is tried; unused by source=prior")
-    edge_length: Positive = Field(0.015, description="of isotropic remeshing, in units of the normalized box")
+    edge_length: float = Field(
+        0.015, gt=0, le=0.3, description="of isotropic remeshing, in units of the normalized box, whose sides are 2"
+    )
     fairing: float = Field(
         0.0, ge=0, le=1, description="world units; bumps of this wavelength lose half of their height"
     )

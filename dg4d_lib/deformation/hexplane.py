@@ -122,12 +122,18 @@ class HexPlane(nn.Module):
         total = self.bounds.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
             if variation:
-                total = total + variation * sum(space.diff(n=2, dim=axis).square().mean() for axis in (-1, -2))
+                total = total + variation * sum(mean_square_curvature(space, axis) for axis in (-1, -2))
             if smoothness:
-                total = total + smoothness * time.diff(n=2, dim=-2).square().mean()
+                total = total + smoothness * mean_square_curvature(time, -2)
             if sparsity:
                 total = total + sparsity * (time - 1).abs().mean()
         return total
+
+
+def mean_square_curvature(planes: Float[Tensor, "..."], axis: int) -> Float[Tensor, ""]:
+    """Return the mean squared second difference along an axis; 0 if it has fewer than three steps."""
+    differences = planes.diff(n=2, dim=axis)
+    return differences.square().mean() if differences.numel() else planes.new_zeros(())
 
 
 def time_lines(planes: Float[Tensor, "3 c steps r"], times: Float[Tensor, " t"]) -> Float[Tensor, "3 t c r"]:

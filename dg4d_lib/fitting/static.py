@@ -27,6 +27,7 @@ SPLIT_SCALE = 0.05  # world units; larger Gaussians are split, smaller ones clon
 RESET_OPACITY_EVERY = 700  # iterations (DreamGaussian); not reached with the default of 500
 LAST_PRUNE = 2.0  # factor on the largest scale in the prune after the last iteration (DreamGaussian: extent 1 for 0.5)
 MIN_GAUSSIANS = 8  # with fewer the fit counts as diverged (ours)
+FARTHEST = 100.0  # world units from the origin; with a mean beyond, the fit counts as diverged (ours; subjects have 1)
 
 
 @dataclass
@@ -97,7 +98,7 @@ def fit_gaussians(
         watch: called after every iteration with the cloud as it is then.
 
     Raises:
-        FitDiverged: the loss became non-finite, or (almost) no Gaussian is left.
+        FitDiverged: the loss became non-finite, (almost) no Gaussian is left, or one is more than 100 world units away.
     """
     device = start.means.device
     white = torch.tensor(WHITE, device=device)
@@ -163,6 +164,7 @@ def fit_gaussians(
             cloud.reset_opacity()
         report(step, {**numbers, "Gaussians": len(cloud.gaussians)})
         watch(cloud.gaussians)
+    require_near(cloud.gaussians)
     return cloud.gaussians.detach()
 
 
@@ -228,6 +230,21 @@ def control_density(cloud: _Cloud, grad2d: Grad2dStats, settings: StaticSettings
         grown = densify(cloud.gaussians, grad2d.mean, settings.densify_gradient, SPLIT_SCALE, room, generator)
         cloud.replace(grown)
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, settings.prune_scale))
+
+
+def require_near(gaussians: Gaussians) -> None:
+    """Refuse a cloud with means far away, from which later stages would diverge.
+
+    Raises:
+        Diverged: says what to lower.
+    """
+    farthest = float(gaussians.means.detach().abs().max())
+    if not farthest <= FARTHEST:
+        raise Diverged(
+            f"fit_gaussians: a Gaussian has a coordinate of {farthest:.3g} world units, at most {FARTHEST:g} are "
+            f"allowed; {ADVICE}",
+            gaussians.detach(),
+        )
 
 
 def require_enough(cloud: _Cloud, step: int, settings: StaticSettings, before: Gaussians) -> None:

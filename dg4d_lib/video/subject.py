@@ -1,5 +1,6 @@
 """Subject preparation: matting, square cropping and resampling of input frames."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.images import over_white
+from dg4d_lib.images import over_white, resize_planes
 from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.framing import (
@@ -23,20 +24,28 @@ from dg4d_lib.video.framing import (
     reframe,
     resample,
 )
-from dg4d_lib.video.matting import Matte, matte
+from dg4d_lib.video.matting import Matte, matte, overlap
 from dg4d_lib.video.segmentation_network import Segmentation
 from dg4d_lib.video.soft_edges import free_colors
 
 OVERSAMPLING = 2  # maximum size of opaque frames before matting, relative to the size of the square
 SMALLEST_SUBJECT = 16  # longest side, pixels; a smaller subject has too few pixels to reconstruct
 NAMED_AT_MOST = 8  # frames that a message lists
-BOX_MARGIN = 0.1  # margin around the user's box that matting sees, as a share of its longest side
+BOX_MARGIN = 0.1  # margin around a box that matting sees, as a share of its longest side
+FOUND_MARGIN = 0.1  # margin around a found subject that may hold missed parts of it, as a share of its longest side
+SAME_SUBJECT = 0.5  # overlap (IoU) of the estimates from the whole picture and from its part that shows the subject
 UNCERTAIN = "so the outline is an estimate; if it is wrong, give a PNG with transparency, --mask FILE or --box X,Y,W,H."
 NOTES = {
     "backdrop": "The background was removed by its plain color; a PNG with transparency gives a more exact outline.",
     "uneven backdrop": f"The background was removed by its color although it is uneven, {UNCERTAIN}",
     "network": f"The background was removed by the segmentation network {{name}}, {UNCERTAIN}",
 }
+COARSE = (
+    "The subject covers a small part of the picture and was cut out of a reduced copy, so details are lost: "
+    "give --box X,Y,W,H around it, or a picture that is cropped to it."
+)
+CERTAINTY = ("backdrop", "uneven backdrop", "network")  # methods of matting, the most exact first
+Box = tuple[int, ...]  # left, top, width, height in pixels, or empty
 
 
 @dataclass(frozen=True)
@@ -63,7 +72,7 @@ class PreparedSubject:
         frames: straight cut-outs with colors extended into transparent pixels.
         notes: sentences for the report.
         estimate: cut-outs in the frame of the source, if alpha was estimated; None if it was given.
-        frame: height and width of the frames that were cropped, pixels; estimates are made on smaller ones.
+        frame: height and width of the frames that were cropped, pixels; `estimate` may be smaller.
         crop: of these frames.
     """
 
@@ -74,6 +83,26 @@ class PreparedSubject:
     estimate: Matte | None = None
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """Cut-outs of a part of the picture.
+
+    Attributes:
+        frames: cut-outs.
+        frame: height and width of the whole picture, in pixels of the cut-outs.
+        left, top: of the part, in pixels of the cut-outs.
+    """
+
+    frames: Float[Tensor, "t h w 4"]
+    frame: tuple[int, int]
+    left: int = 0
+    top: int = 0
+
+
+def _whole(frames: Float[Tensor, "t h w 4"]) -> _Shown:
+    return _Shown(frames, (frames.shape[1], frames.shape[2]))
+
+
 def prepare_subject(
     frames: Float[Tensor, "t h w 4"],
     has_alpha: bool,
@@ -82,6 +111,9 @@ def prepare_subject(
     segmenter: Segmenter = U2NETP,
 ) -> PreparedSubject:
     """Cut out, crop and resample the subject, the same way in all frames.
+
+    Opaque frames are matted at a reduced size. Where the square would get fewer pixels than `settings.size` from these,
+    the part that shows the subject is matted again, so that the crop has the resolution of the source.
 
     Args:
         frames: straight sRGB and alpha in [0, 1].
@@ -99,14 +131,15 @@ def prepare_subject(
     estimate = None
     given = has_alpha or mask is not None
     if mask is not None:
-        frames = apply_mask(frames, mask)
+        shown = _whole(apply_mask(frames, mask))
     elif settings.matting != "none" and not (settings.matting == "auto" and has_alpha):
-        estimate = _estimate(frames, settings, segmenter)
-        frames, notes = estimate.frames, (NOTES[estimate.method].format(name=segmenter.name),)
+        estimate, shown, notes = _estimated(frames, settings, segmenter)
         given = False
+    else:
+        shown = _whole(frames)
     if settings.box and estimate is None:
-        frames = _inside(frames, settings.box)
-    alpha = frames[..., 3]
+        shown = _whole(_inside(shown.frames, settings.box))
+    alpha = shown.frames[..., 3]
     bounding_box(alpha)  # raises if no frame shows anything
     check_shown(alpha)
     left, top, right, bottom = bounding_box(alpha[:1])
@@ -119,8 +152,9 @@ def prepare_subject(
     crop = crop_whole_frame(*alpha.shape[1:]) if keep else crop_around_subject(alpha, settings.border)
     if not (alpha <= VISIBLE).any():
         notes = (*notes, "The subject fills the whole picture, so there is no outline to build a shape from.")
-    height, width = alpha.shape[1:]
-    return PreparedSubject(reframe(frames, crop, settings.size), (height, width), crop, notes, estimate)
+    square = reframe(shown.frames, crop, settings.size)
+    in_frame = Crop(crop.left + shown.left, crop.top + shown.top, crop.side)
+    return PreparedSubject(square, shown.frame, in_frame, notes, estimate)
 
 
 def check_shown(alpha: Float[Tensor, "t h w"]) -> None:
@@ -139,7 +173,7 @@ def check_shown(alpha: Float[Tensor, "t h w"]) -> None:
     )
 
 
-def check_box(box: tuple[int, ...], width: int, height: int) -> None:
+def check_box(box: Box, width: int, height: int) -> None:
     """Refuse a box that is not inside a picture of this size.
 
     Raises:
@@ -166,17 +200,26 @@ def apply_mask(frames: Float[Tensor, "t h w 4"], mask: Float[Tensor, "t h w"]) -
     return torch.stack([free_colors(frame[..., :3], alpha) for frame, alpha in zip(frames, mask, strict=True)])
 
 
+def _estimated(
+    frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segmenter: Segmenter
+) -> tuple[Matte, _Shown, tuple[str, ...]]:
+    """Return the estimate in the frame of the source, cut-outs to crop from, and notes."""
+    estimate = _estimate(frames, settings, segmenter)
+    shown = _whole(estimate.frames)
+    notes: tuple[str, ...] = ()
+    if box := _small_subject(frames, estimate, settings):
+        if closer := _look_closer(frames, box, estimate, settings, segmenter):
+            estimate, shown = closer
+        else:
+            notes = (COARSE,)
+    return estimate, shown, (NOTES[estimate.method].format(name=segmenter.name), *notes)
+
+
 def _estimate(frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segmenter: Segmenter) -> Matte:
-    """Cut the subject out of frames, over white where they are transparent, within the user's box."""
-    method: Literal["auto", "backdrop", "network"] = "network"
-    match settings.matting:
-        case "auto" | "backdrop" as chosen:
-            method = chosen
+    """Cut the subject out of frames within the user's box, at full size if there is a box."""
     window = _window(settings.box, frames.shape[2], frames.shape[1])
     seen = frames[:, window[0], window[1]]
-    opaque = torch.cat([over_white(seen), torch.ones_like(seen[..., 3:])], -1)
-    small = downscale(opaque, OVERSAMPLING * settings.size)
-    found = matte(small[..., :3], method, segmenter.load)
+    found = _matte(seen, settings, segmenter)
     if not settings.box:
         return found
     cutouts = torch.zeros_like(frames)
@@ -186,7 +229,88 @@ def _estimate(frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segme
     return replace(found, frames=_inside(cutouts, settings.box))
 
 
-def _window(box: tuple[int, ...], width: int, height: int) -> tuple[slice, slice]:
+def _matte(frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segmenter: Segmenter) -> Matte:
+    """Cut the subject out of frames, over white where they are transparent, at a reduced size."""
+    method: Literal["auto", "backdrop", "network"] = "network"
+    match settings.matting:
+        case "auto" | "backdrop" as chosen:
+            method = chosen
+    opaque = torch.cat([over_white(frames), torch.ones_like(frames[..., 3:])], -1)
+    small = downscale(opaque, OVERSAMPLING * settings.size)
+    return matte(small[..., :3], method, segmenter.load)
+
+
+def _small_subject(frames: Float[Tensor, "t h w 4"], estimate: Matte, settings: SubjectSettings) -> Box:
+    """Return a box around a subject whose square lost pixels by the reduction before matting; else an empty one."""
+    alpha = estimate.frames[..., 3]
+    if settings.framing == "keep" or not (alpha > VISIBLE).any():
+        return ()
+    height, width = frames.shape[1:3]
+    rows, columns = _window(settings.box, width, height)
+    seen = max(rows.stop - rows.start, columns.stop - columns.start)
+    scale = max(height, width) / max(alpha.shape[1:])
+    reduction = max(1.0, seen / (OVERSAMPLING * settings.size))
+    if reduction == 1 or crop_around_subject(alpha, settings.border).side * scale / reduction >= settings.size:
+        return ()
+    left, top, right, bottom = (edge * scale for edge in bounding_box(alpha))
+    margin = FOUND_MARGIN * max(right - left, bottom - top) + reduction
+    x, y, w, h = settings.box or (0, 0, width, height)
+    left, top = max(x, math.floor(left - margin)), max(y, math.floor(top - margin))
+    right, bottom = min(x + w, math.ceil(right + margin)), min(y + h, math.ceil(bottom + margin))
+    return left, top, right - left, bottom - top
+
+
+def _look_closer(
+    frames: Float[Tensor, "t h w 4"], box: Box, estimate: Matte, settings: SubjectSettings, segmenter: Segmenter
+) -> tuple[Matte, _Shown] | None:
+    """Cut the subject out of the part of the frames around it; None if it is not found there again.
+
+    Args:
+        frames: the source.
+        box: around the subject in all frames, pixels of `frames`.
+        estimate: from the whole frames.
+        settings: matting and size.
+        segmenter: network.
+
+    Returns:
+        The estimate with its new alpha, in its own size, and cut-outs of the part in pixels of the source.
+    """
+    height, width = frames.shape[1:3]
+    x, y, w, h = box
+    rows, columns = _window(box, width, height)
+    try:
+        found = _matte(frames[:, rows, columns], settings, segmenter)
+    except BadInput:
+        return None
+    inside = slice(y - rows.start, y - rows.start + h), slice(x - columns.start, x - columns.start + w)
+    part = frames.new_empty(len(frames), h, w, 4)
+    for cutout, each in zip(part, found.frames, strict=True):
+        cutout[:] = resample(each[None], rows.stop - rows.start, columns.stop - columns.start)[0][inside]
+    before = estimate.frames[..., 3]
+    alpha = torch.zeros_like(before)
+    place = _scaled(y, h, before.shape[1] / height), _scaled(x, w, before.shape[2] / width)
+    small = alpha[:, place[0], place[1]]
+    small[:] = resize_planes(part[None, ..., 3], small.shape[1:])[0]
+    lost = (before > VISIBLE).any(2).any(1) & ~(alpha > VISIBLE).any(2).any(1)
+    if lost.any() or overlap(alpha > 0.5, before > 0.5) < SAME_SUBJECT:
+        return None
+    agreements = [each.agreement for each in (estimate, found) if each.agreement is not None]
+    merged = Matte(
+        torch.cat([estimate.frames[..., :3], alpha[..., None]], -1),
+        max(estimate.method, found.method, key=CERTAINTY.index),
+        min(agreements, default=None),
+        estimate.used_network or found.used_network,
+    )
+    return merged, _Shown(part, (height, width), x, y)
+
+
+def _scaled(start: int, length: int, scale: float) -> slice:
+    """Return the pixels of a span at another size, at least one."""
+    first = round(scale * start)
+    return slice(first, max(first + 1, round(scale * (start + length))))
+
+
+def _window(box: Box, width: int, height: int) -> tuple[slice, slice]:
     """Return rows and columns of the box with a margin; of the whole picture without a box."""
     if not box:
         return slice(0, height), slice(0, width)
@@ -198,7 +322,7 @@ def _window(box: tuple[int, ...], width: int, height: int) -> tuple[slice, slice
     )
 
 
-def _inside(frames: Float[Tensor, "t h w 4"], box: tuple[int, ...]) -> Float[Tensor, "t h w 4"]:
+def _inside(frames: Float[Tensor, "t h w 4"], box: Box) -> Float[Tensor, "t h w 4"]:
     """Make the pixels outside of a box transparent."""
     x, y, w, h = box
     kept = torch.zeros_like(frames[..., 3])

@@ -11,8 +11,10 @@ import small_package
 import torch
 import trimesh
 from pxr import Usd, UsdGeom
+from pydantic import ValidationError
 from small_package import FPS, FRAMES, NOTE, REACH, cloud, extracted, gem, inputs, job, packed, tracked
 
+from dg4d_lib.asset_settings import SMALLEST_HEIGHT_M, PackSettings
 from dg4d_lib.assets import resample
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
@@ -158,6 +160,18 @@ def test_a_rate_that_cannot_be_had_is_noted(
     assert (
         f"the files have {manifest.fps:g} frames per second instead of {fps:g} (pack.fps): {reason}" in manifest.notes
     )
+
+
+def test_the_smallest_height_makes_a_package(tmp_path: Path) -> None:
+    folder = packed(tmp_path, height_m=SMALLEST_HEIGHT_M, rig=False, usd=False, splats=False, spz=False)
+    low, high = trimesh.load(folder / "asset.glb").bounds
+    assert high[1] - low[1] == pytest.approx(SMALLEST_HEIGHT_M, rel=1e-3)
+
+
+@pytest.mark.parametrize("height_m", [1e-300, 0.9 * SMALLEST_HEIGHT_M])
+def test_a_height_that_floating_point_numbers_do_not_hold_is_refused(height_m: float) -> None:
+    with pytest.raises(ValidationError, match="use 0 for one meter per unit of the fit, or 1e-06 to 1000"):
+        PackSettings(height_m=height_m)
 
 
 def test_formats_that_lose_something_are_noted(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess
 from dg4d_lib.settings import MeshSettings
 
 PROGRAM = "dg4d_lib.mesh.extraction.pymeshlab_program"
+SHRUNK = 0.5  # diagonal of the bounding box, relative to that before, below which the surface counts as collapsed
 
 
 def clean(
@@ -28,7 +29,7 @@ def clean(
     Raises:
         BadInput: there are no faces.
         BackendUnavailable: pymeshlab or a system library that its filters need is missing.
-        DG4DError: the cleaning process crashed or left no faces.
+        DG4DError: the cleaning process crashed or left no faces, or edges are so long that the surface collapsed.
     """
     if len(faces) == 0:
         raise BadInput("a mesh without faces cannot be cleaned; lower mesh.density_threshold")
@@ -44,6 +45,13 @@ def clean(
     vertices, faces = drop_small_components(cleaned["vertices"], cleaned["faces"], settings.min_component)
     if len(faces) == 0:
         raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")
+    share = _diagonal(vertices) / _diagonal(arrays["vertices"])
+    if share < SHRUNK:
+        raise DG4DError(
+            f"mesh cleaning shrank the surface to {share:.1%} of its size, at least {SHRUNK:.0%} is allowed: edges of "
+            f"{length:.3g} units of the normalized box are too long for it; raise mesh.grid or "
+            "mesh.max_faces, or lower mesh.edge_length"
+        )
     return (vertices * unit).astype(np.float32), orient_outward(vertices, faces).astype(np.int32)
 
 
@@ -58,6 +66,10 @@ def drop_small_components(
     kept = faces[(sizes >= min(share * len(faces), sizes.max()))[component]]
     used, renumbered = np.unique(kept, return_inverse=True)
     return vertices[used], renumbered.reshape(kept.shape).astype(faces.dtype)
+
+
+def _diagonal(vertices: Float[np.ndarray, "v 3"]) -> float:
+    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
 
 
 def _edge_length_for(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int) -> float:

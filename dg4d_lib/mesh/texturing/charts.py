@@ -128,7 +128,9 @@ def _straightened(surface: "_Surface", labels: Labels, limits: Limits) -> Labels
         straight = surface.straightened(labels, movable=~fixed[labels])
         parts = surface.connected(straight)
         pieces = np.bincount(straight[np.unique(parts, return_index=True)[1]], minlength=len(fixed))
-        failed = (pieces != 1) | ~surface.passes(straight, everywhere, limits)
+        passed = np.zeros(len(fixed), bool)
+        passed[: straight.max() + 1] = surface.passes(straight, everywhere, limits)
+        failed = (pieces != 1) | ~passed  # a chart without faces has no piece
         if not (failed & ~fixed).any():
             return straight
         fixed |= failed

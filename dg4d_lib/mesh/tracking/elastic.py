@@ -86,10 +86,11 @@ def relax(
 
     def relax_frame(frame: int) -> None:
         tracked = (vertices + offsets[frame]).double().numpy()
-        moved, left = body.relaxed(tracked, GENTLE)
+        first = body.first_round(tracked)
+        moved, left = body.relaxed(tracked, GENTLE, first)
         if silhouettes is not None and left:
             outline = silhouettes[frame, None]
-            strong, still_left = body.relaxed(tracked, STRONG)
+            strong, still_left = body.relaxed(tracked, STRONG, first)
             if still_left < left and _iou(strong, faces, outline) >= _iou(moved, faces, outline) - MAX_LOSS:
                 moved = strong
         relaxed[frame] = torch.from_numpy(moved - body.rest).to(offsets)
@@ -168,7 +169,7 @@ class ElasticBody:
 
     @cached_property
     def _whole(self) -> SuperLU:
-        """Factors for vertices that are all free and pulled alike; only `relaxed` needs them."""
+        """Factors for vertices that are all free and pulled alike; only `first_round` needs them."""
         return screened_factors(self.laplacian, np.full(len(self.rest), PULL))
 
     def defective(
@@ -195,11 +196,17 @@ class ElasticBody:
         _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, np.arange(len(moved)), rotations)
         return rotations
 
-    def relaxed(self, tracked: Float64[np.ndarray, "v 3"], effort: Effort) -> tuple[Float64[np.ndarray, "v 3"], int]:
-        """Return the relaxed positions of one frame, and how many faces have defects there."""
+    def first_round(self, tracked: Float64[np.ndarray, "v 3"]) -> Pose:
+        """Relax all vertices of one frame alike, as every effort begins."""
+        moved = self.settle(tracked, tracked, np.full(len(tracked), PULL))
+        return Pose(moved, self.defective(moved))
+
+    def relaxed(
+        self, tracked: Float64[np.ndarray, "v 3"], effort: Effort, first: Pose
+    ) -> tuple[Float64[np.ndarray, "v 3"], int]:
+        """Return the relaxed positions of one frame after its `first_round`, and how many faces have defects there."""
         pull = np.full(len(tracked), PULL)
-        moved = self.settle(tracked, tracked, pull)
-        defective = self.defective(moved)
+        moved, defective = first
         for _ in range(effort.rounds - 1):
             if not defective.any():
                 break

@@ -68,7 +68,8 @@ def separate(
     """
     moved = (vertices + offsets).double().numpy()
     triangles = faces.numpy()
-    counts = _crossings(moved, triangles)
+    crossing = _crossings(moved, triangles)
+    counts = crossing.sum(1)
     if not counts.any():
         return offsets, 0
     balls = InnerBalls(vertices.double().numpy(), triangles)
@@ -78,14 +79,16 @@ def separate(
         found: Float[np.ndarray, " m"] = overlaps.numpy()
         return found
 
-    pushed = push_apart(balls, moved, loop)
+    pushed, crossing = push_apart(balls, moved, crossing, loop)
     mended = pushed.copy()
 
     def mend(frame: int) -> None:
         mended[frame] = unfold(pushed[frame], triangles)
 
-    run_parallel([partial(mend, int(frame)) for frame in np.flatnonzero(_crossings(pushed, triangles))])
-    crossed, left = np.flatnonzero(counts), _crossings(mended, triangles)
+    still = np.flatnonzero(crossing.any(1))
+    run_parallel([partial(mend, int(frame)) for frame in still])
+    crossed, left = np.flatnonzero(counts), np.zeros_like(counts)
+    left[still] = _crossings(mended[still], triangles).sum(1)
     fewer = left.sum() <= GAIN * counts.sum()
     if fewer and (iou(mended[crossed], crossed, 1) - iou(moved[crossed], crossed, 1)).mean() >= -MAX_LOSS:
         moved, counts = mended, left
@@ -137,22 +140,35 @@ def cap(
     return best
 
 
-def push_apart(balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: bool) -> Float64[np.ndarray, "t v 3"]:
-    """Return the vertices of all frames with submerged parts pushed out of others, as far as that is possible.
+def push_apart(
+    balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], crossing: Bool[np.ndarray, "t f"], loop: bool
+) -> tuple[Float64[np.ndarray, "t v 3"], Bool[np.ndarray, "t f"]]:
+    """Push submerged parts out of others in all frames, as far as that is possible.
 
     Every round finds the contacts of the present positions, keeps those of earlier rounds, and solves for the smoothest
     shifts of the control nodes that move all of them apart.
+
+    Args:
+        balls: inner balls of the surface.
+        moved: vertices of all frames.
+        crossing: faces of these that cross others.
+        loop: the last frame is followed by the first one.
+
+    Returns:
+        Vertices and crossing faces of all frames, with the fewest crossings that were found.
     """
     shifts = _Shifts(balls, moved, loop)
     directions = np.zeros((len(moved), len(balls.control.nodes), 3))
     contacts = np.empty((0, 3), np.int64)
-    fewest, best, waited = np.inf, moved, 0
-    for _ in range(ROUNDS):
+    best, least, waited = moved, crossing, 0
+    for number in range(ROUNDS):
         present, centers = shifts.apply()
-        count, found, pushes = _search(balls, present, centers)
-        fewest, best, waited = (count, present, 0) if count < fewest else (fewest, best, waited + 1)
-        if count == 0 or waited == PATIENCE:
+        if number > 0:
+            crossing = _crossings(present, balls.body.faces)
+            best, least, waited = (present, crossing, 0) if crossing.sum() < least.sum() else (best, least, waited + 1)
+        if not crossing.any() or waited == PATIENCE:
             break
+        found, pushes = _submerged(balls, present, centers, crossing)
         steady = gaussian_filter1d(pushes, STEADY, axis=0, mode="wrap" if loop else "nearest")
         known = np.linalg.norm(steady, axis=2, keepdims=True) > 0
         directions = np.where(known, steady, directions)
@@ -162,35 +178,36 @@ def push_apart(balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], loop: boo
             contacts = np.unique(np.concatenate([contacts, rows]), axis=0)
         if not shifts.solve(contacts, present, centers):
             break
-    return best
+    return best, least
 
 
-def _search(
-    balls: InnerBalls, moved: Float64[np.ndarray, "t v 3"], centers: Float64[np.ndarray, "t b 3"]
-) -> tuple[int, list[Submerged], Float64[np.ndarray, "t m 3"]]:
-    """Return the number of crossing faces over all frames, what is submerged at each, and `_pushes` of each."""
-    counts, found = np.zeros(len(moved), np.int64), dict[int, Submerged]()
+def _submerged(
+    balls: InnerBalls,
+    moved: Float64[np.ndarray, "t v 3"],
+    centers: Float64[np.ndarray, "t b 3"],
+    crossing: Bool[np.ndarray, "t f"],
+) -> tuple[list[Submerged], Float64[np.ndarray, "t m 3"]]:
+    """Return what is submerged at each frame, near its crossing faces, and `_pushes` of each."""
+    found = dict[int, Submerged]()
     pushes = np.zeros((len(moved), len(balls.control.nodes), 3))
 
     def search(frame: int) -> None:
-        crossing = self_intersecting(moved[frame], balls.body.faces)
-        counts[frame] = crossing.sum()
-        found[frame] = balls.submerged(moved[frame], centers[frame], crossing)
+        found[frame] = balls.submerged(moved[frame], centers[frame], crossing[frame])
         pushes[frame] = _pushes(balls, found[frame], moved[frame], centers[frame])
 
     run_parallel([partial(search, frame) for frame in range(len(moved))])
-    return int(counts.sum()), [found[frame] for frame in range(len(moved))], pushes
+    return [found[frame] for frame in range(len(moved))], pushes
 
 
-def _crossings(moved: Float64[np.ndarray, "t v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " t"]:
-    """Return the number of crossing faces of every frame."""
-    counts = np.zeros(len(moved), np.int64)
+def _crossings(moved: Float64[np.ndarray, "t v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, "t f"]:
+    """Mark the faces of every frame that cross others."""
+    crossing = np.zeros((len(moved), len(faces)), bool)
 
-    def count(frame: int) -> None:
-        counts[frame] = self_intersecting(moved[frame], faces).sum()
+    def search(frame: int) -> None:
+        crossing[frame] = self_intersecting(moved[frame], faces)
 
-    run_parallel([partial(count, frame) for frame in range(len(moved))])
-    return counts
+    run_parallel([partial(search, frame) for frame in range(len(moved))])
+    return crossing
 
 
 def _pushes(
@@ -235,7 +252,8 @@ class _Shifts:
         following = np.stack([np.arange(frames), np.arange(1, frames + 1) % frames], 1)[: None if loop else -1]
         time = graph_laplacian(symmetric_matrix(following, np.ones(len(following)), frames))
         self._laplacian = csr_array(kron(eye_array(frames), space) + FRAMES * kron(time, eye_array(nodes)))
-        self._factors = [screened_factors(self._laplacian, np.full(frames * nodes, pull)) for pull in PULLS]
+        factors = {pull: screened_factors(self._laplacian, np.full(frames * nodes, pull)) for pull in set(PULLS)}
+        self._factors = [factors[pull] for pull in PULLS]
         self._balls, self._moved = balls, moved
         self._centers = np.stack([balls.centers(frame) for frame in moved])
         self._axes, self._center_axes = _axes(moved), _axes(self._centers)

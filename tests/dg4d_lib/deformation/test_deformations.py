@@ -154,6 +154,19 @@ def test_planes_that_change_evenly_cost_nothing():
     assert field.regularization_loss() < 1e-12  # a first difference would see the slope
 
 
+@pytest.mark.parametrize("temporal", [2, 3])
+@pytest.mark.parametrize("spatial", [2, 3])
+def test_the_regularizers_of_the_smallest_planes_are_finite(spatial: int, temporal: int):
+    weights = dict.fromkeys(("variation_weight", "smoothness_weight", "sparsity_weight"), 1.0)
+    settings = HexPlaneSettings(spatial=spatial, temporal=temporal, features=2, hidden=4, **weights)
+    field = HexPlane(settings, BOX, torch.Generator().manual_seed(0))
+    loss = field.regularization_loss()
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert all(plane.grad is None or torch.isfinite(plane.grad).all() for plane in field.grid_parameters())
+    assert (loss > 0) == (spatial > 2)  # two steps have no second difference
+
+
 @pytest.mark.parametrize("kind", ["hexplane", "mlp"])
 def test_the_last_layer_of_the_means_carries_the_unit_of_length(kind: str, cloud):
     deformation = make(kind)

@@ -110,6 +110,11 @@ def test_splats_at_one_place_are_tracked() -> None:
     assert find_parts(graph)
 
 
+def test_the_dense_system_of_the_most_nodes_fits_into_memory() -> None:
+    most = AssetSettings.model_json_schema()["properties"]["nodes"]["maximum"]
+    assert (6 * most) ** 2 * np.dtype(np.float64).itemsize <= 300e6
+
+
 def test_depth_is_not_extrapolated() -> None:
     points, _ = scene()
     tracker = tracker_of(points, SETTINGS.model_copy(update={"inertia": 1.0}))

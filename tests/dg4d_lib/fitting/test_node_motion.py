@@ -7,10 +7,11 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
+from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
 from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
-from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
+from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_of_points, point_graph
 
 ANGLE = 1.0  # radians
 
@@ -69,3 +70,14 @@ def test_variables_of_a_pose_stand_for_it(plate: ControlGraph, integrated: bool)
     motion = NodeVariables.of(pose, basis).motion(basis)
     torch.testing.assert_close(motion.shifts[0], torch.from_numpy(pose.shifts).float(), atol=1e-4, rtol=0)
     torch.testing.assert_close(quat_to_rotmat(motion.quats[0]), torch.from_numpy(pose.turns).float(), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("nodes", [40, 100])
+def test_variables_of_a_pose_stand_for_it_at_the_strongest_smoothing(nodes: int) -> None:
+    strongest = AssetSettings.model_json_schema()["properties"]["smoothing"]["maximum"]
+    points = np.random.default_rng(1).normal(size=(nodes, 3))
+    graph = graph_of_points(points, point_graph(points), nodes)
+    pose = Pose(np.tile(np.eye(3), (nodes, 1, 1)), np.random.default_rng(0).normal(size=(nodes, 3)))
+    basis = NodeBasis(graph, strongest, integrated=False)
+    motion = NodeVariables.of(pose, basis).motion(basis)
+    torch.testing.assert_close(motion.shifts[0], torch.from_numpy(pose.shifts).float(), atol=0.01, rtol=0)

@@ -103,6 +103,12 @@ def test_a_cloud_that_vanishes_is_an_error_not_an_empty_asset(known, static_sett
         fit_gaussians(blob(50, 0.5, seed()), known.subject(), known.prior(0.98), known.rasterize, greedy, seed())
 
 
+def test_a_cloud_that_flies_away_is_an_error_of_this_stage(known, static_settings):
+    fast = static_settings.model_copy(update={"iterations": 2, "means_lr": 1e30, "means_lr_end": 1e30})
+    with pytest.raises(FitDiverged, match=r"e\+30 world units, at most 100 are allowed; lower .*static\.\*_lr"):
+        fit_gaussians(blob(50, 0.5, seed()), known.subject(), known.prior(0.98), known.rasterize, fast, seed())
+
+
 @pytest.mark.parametrize(("iterations", "left"), [(10, 60), (7, 100)])
 def test_the_last_iteration_prunes_and_adds_nothing(iterations: int, left: int, known, static_settings):
     """As DreamGaussian after its last iteration, where the limit of the scale is twice that of densification.

@@ -47,6 +47,19 @@ def test_there_are_no_more_faces_than_allowed(sphere: Mesh) -> None:
     assert 350 < len(faces) <= 500
 
 
+def test_the_longest_edges_keep_a_sphere_and_longer_ones_are_refused(sphere: Mesh) -> None:
+    longest = MeshSettings.model_json_schema()["properties"]["edge_length"]["maximum"]
+    vertices, _ = clean(*sphere, MeshSettings(edge_length=longest))
+    assert (np.ptp(vertices, axis=0) >= 0.8 * np.ptp(sphere[0], axis=0)).all()
+    with pytest.raises(DG4DError, match=r"shrank the surface to .*raise mesh\.grid .*lower mesh\.edge_length"):
+        clean(*sphere, MeshSettings.model_construct(**dict(MeshSettings()) | {"edge_length": 0.45}))
+
+
+def test_a_small_sphere_that_collapses_is_refused(sphere: Mesh) -> None:
+    with pytest.raises(DG4DError, match=r"shrank the surface to [\d.]+% of its size, at least 50% is allowed"):
+        clean(0.2 * sphere[0], sphere[1], MeshSettings(edge_length=0.3))
+
+
 def test_sheets_that_almost_touch_stay_apart() -> None:
     """Merging the ends of their edges would leave an edge of four triangles."""
     box = trimesh.creation.box(bounds=[[-0.5, -0.5, -0.5], [0, 0, 0.5]])
@@ -99,11 +112,11 @@ def test_a_mesh_without_faces_is_refused(sphere: Mesh) -> None:
 def test_pymeshlab_stays_out_of_the_calling_process() -> None:
     code = """if True:
         import sys
-        import numpy as np
+        import trimesh
         from dg4d_lib.mesh.extraction.clean import clean
         from dg4d_lib.settings import MeshSettings
-        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-        clean(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), MeshSettings(edge_length=0.2))
+        ball = trimesh.creation.icosphere(3)
+        clean(ball.vertices.astype("f4"), ball.faces.astype("i4"), MeshSettings(edge_length=0.2))
         sys.exit("pymeshlab" in sys.modules or "torch" in sys.modules)
     """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

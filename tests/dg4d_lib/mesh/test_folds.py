@@ -1,5 +1,7 @@
 """Folds, crossings, flips and handles on shapes for which they are known, and their removal."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -208,6 +210,24 @@ def test_a_stronger_relaxation_is_kept_where_the_outlines_allow_it() -> None:
     strong = relax(rest, offsets, triangles, torch.zeros_like(outlines))  # an IoU of 0 cannot fall
     left = [DefectFinder(faces, vertices).defective((rest + found[0]).numpy()).sum() for found in (strong, gentle)]
     assert 0 < left[0] < left[1]
+
+
+def test_the_stronger_relaxation_begins_with_the_first_round_of_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = tube()
+    rest, triangles = torch.from_numpy(vertices).float(), torch.from_numpy(faces)
+    offsets = torch.from_numpy(bent(vertices, 150.0)).float()[None] - rest
+    whole = 0
+    settle = ElasticBody.settle
+
+    def counted(body: ElasticBody, *args: Any) -> np.ndarray:
+        nonlocal whole
+        whole += len(args) == 3  # without the vertices that are free
+        return settle(body, *args)
+
+    monkeypatch.setattr(ElasticBody, "settle", counted)
+    strong = relax(rest, offsets, triangles, torch.zeros(1, 2, 128, 128, dtype=torch.bool))
+    assert whole == 1
+    assert not torch.equal(strong, relax(rest, offsets, triangles))
 
 
 def test_a_rigid_motion_is_left_as_it_is() -> None:

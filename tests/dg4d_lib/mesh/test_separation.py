@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import SuperLU
 from skimage.measure import marching_cubes
 
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.extraction.silhouettes import cameras_of
 from dg4d_lib.mesh.folds import self_intersecting
+from dg4d_lib.mesh.neighbors import screened_factors
+from dg4d_lib.mesh.tracking import separation
 from dg4d_lib.mesh.tracking.separation import cap, push_apart, separate
 from dg4d_lib.mesh.tracking.submerged import InnerBalls, inner_balls
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
@@ -126,11 +130,37 @@ def test_an_arm_comes_out_of_the_body_along_the_rays_of_the_input_camera(
 
 def test_the_motion_stays_steady(body_with_arm: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     rest, faces, frames = body_with_arm
-    moved = push_apart(InnerBalls(rest, faces), frames, loop=False) - frames
+    crossing = np.stack([self_intersecting(frame, faces) for frame in frames])
+    pushed, left = push_apart(InnerBalls(rest, faces), frames, crossing, loop=False)
+    assert np.array_equal(left.sum(1), crossings(pushed, faces))
+    moved = pushed - frames
     hand = (rest[:, 0] > 0.3) & (rest[:, 1] < 0.1)
     depth = moved[:, hand, 2].mean(1)
     assert depth.argmax() in range(2, FRAMES - 2) and depth.max() > 0.05
     assert np.abs(np.diff(depth)).max() < 0.6 * depth.max()  # no jump where the contact begins
+
+
+def test_no_frame_is_searched_twice_and_equal_pulls_share_their_factors(
+    body_with_arm: tuple[np.ndarray, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest, faces, frames = body_with_arm
+    frames = frames[1:3]  # no two are alike, unlike those of the way there and back
+    searched, factored = list[bytes](), list[float]()
+
+    def search(moved: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        searched.append(moved.tobytes())
+        return self_intersecting(moved, triangles)
+
+    def factors(laplacian: csr_array, pull: np.ndarray) -> SuperLU:
+        factored.append(pull[0])
+        return screened_factors(laplacian, pull)
+
+    monkeypatch.setattr(separation, "self_intersecting", search)
+    monkeypatch.setattr(separation, "screened_factors", factors)
+    _, count = separated(rest, faces, frames, silhouettes_of(frames, faces))
+    assert count > 0 and len(searched) > 2 * len(frames)
+    assert len(set(searched)) == len(searched)
+    assert sorted(factored) == sorted(set(separation.PULLS))
 
 
 def test_a_motion_without_crossings_stays_as_it_is(body_with_arm: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:

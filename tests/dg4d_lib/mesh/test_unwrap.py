@@ -5,11 +5,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import DG4DError
+from dg4d_lib.mesh.extraction.clean import drop_small_components
 from dg4d_lib.mesh.texturing.chart_packing import THOROUGH
+from dg4d_lib.mesh.texturing.charts import find_charts
 from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.unwrap import SMOOTHING, unwrap
 
@@ -138,6 +142,27 @@ def test_loose_and_degenerate_triangles_get_charts_too() -> None:
     sources, new, uvs = unwrap(corners, faces, SIZE)
     np.testing.assert_array_equal(sources[new], faces)
     assert np.isfinite(uvs).all()
+
+
+def random_surface(seed: int) -> Mesh:
+    """Closed surfaces of 8 to 300 faces."""
+    random = np.random.default_rng(seed)
+    side = int(random.integers(4, 9))
+    field = gaussian_filter(random.standard_normal((side, side, side)), 0.8)
+    vertices, faces, _, _ = marching_cubes(np.pad(field / field.std(), 1, constant_values=-5.0), 0.3)
+    vertices, faces = drop_small_components(vertices, faces.astype(np.int64), 0.2)
+    return vertices.astype(np.float32), faces
+
+
+@pytest.mark.parametrize("seed", [*range(30, 40), 74, 94, 114, 155, 200, 283])
+def test_random_surfaces_of_few_faces_fall_into_charts(seed: int) -> None:
+    """Straightening swallows the chart with the highest number on nine of these."""
+    vertices, faces = random_surface(seed)
+    found = find_charts(vertices, faces, taubin_smooth(vertices, faces, SMOOTHING))
+    np.testing.assert_array_equal(found.sources[found.faces], faces)
+    assert np.isfinite(found.flat).all()
+    sides = found.flat[found.faces[:, 1:]] - found.flat[found.faces[:, :1]]
+    assert (np.linalg.det(sides) >= 0).all()
 
 
 def test_smoothing_takes_noise_away_and_keeps_the_size(sphere: Mesh) -> None:

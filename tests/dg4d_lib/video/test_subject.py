@@ -1,10 +1,13 @@
+import numpy as np
 import pytest
 import torch
+from skimage import data
+from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video.framing import bounding_box
-from dg4d_lib.video.subject import prepare_subject
+from dg4d_lib.video.subject import COARSE, Segmenter, prepare_subject
 
 
 def cutout(size: int = 96, top: int = 20, left: int = 30, height: int = 50, width: int = 30) -> torch.Tensor:
@@ -92,3 +95,76 @@ def test_a_filled_frame_says_that_it_has_no_outline():
     full[..., 3] = 0.9
     notes = prepare_subject(full, True, SubjectSettings(size=64, framing="keep")).notes
     assert any("no outline" in note for note in notes)
+
+
+def small_disc(side: int, radius: int, column: int) -> Tensor:
+    """Opaque picture of a disc with a pattern of 3 x 3 pixels before white, "1 side side 4"."""
+    rows, columns = np.mgrid[:side, :side]
+    dark = ((columns // 3 + rows // 3) % 2)[..., None]
+    pattern = np.where(dark, (0.1, 0.1, 0.5), (0.9, 0.1, 0.1))
+    inside = np.hypot(rows - side // 2, columns - column) < radius
+    picture = np.where(inside[..., None], pattern, 1.0)
+    return torch.from_numpy(np.dstack([picture, np.ones((side, side))])[None]).float()
+
+
+def contrast(cutout: Tensor) -> float:
+    inside = (cutout[:, 1:, 3] > 0.99) & (cutout[:, :-1, 3] > 0.99)
+    return float(cutout[..., :3].diff(dim=1).abs().mean(-1)[inside].mean())
+
+
+@pytest.mark.parametrize("box", [(), (20, 20, 470, 470)])
+def test_a_small_subject_keeps_the_resolution_of_its_picture(box):
+    opaque = small_disc(512, 28, 300)
+    known = opaque.clone()
+    known[..., 3] = (opaque[..., :3] < 0.95).any(-1).float()
+    settings = SubjectSettings(size=64, matting="backdrop", framing="center", box=box)
+    prepared = prepare_subject(opaque, False, settings)
+    true = prepare_subject(known, True, settings.model_copy(update={"matting": "none"}))
+    assert prepared.crop.side >= 64 and prepared.frame == true.frame == (512, 512)
+    assert abs(prepared.crop.left - true.crop.left) <= 2 and abs(prepared.crop.top - true.crop.top) <= 2
+    assert contrast(prepared.frames[0]) > 0.9 * contrast(true.frames[0])
+    assert COARSE not in prepared.notes
+    longest = 512 if box else 128
+    estimate = prepared.estimate.frames[0, ..., 3]
+    assert estimate.shape == (longest, longest)
+    assert float(estimate.mean()) == pytest.approx(float(known[..., 3].mean()), rel=0.1)
+
+
+def test_the_crop_of_a_small_subject_that_moves_holds_it_in_all_frames():
+    frames = torch.cat([small_disc(512, 24, column) for column in (180, 200, 230)])
+    prepared = prepare_subject(frames, False, SubjectSettings(size=128, matting="backdrop"))
+    crop = prepared.crop
+    assert crop.side >= 120 and prepared.frame == (512, 512)
+    assert crop.left < 156 and crop.left + crop.side > 254
+    shown = (prepared.frames[..., 3] > 0.5).float().mean((1, 2)) * crop.side**2
+    assert shown.numpy() == pytest.approx(np.pi * 24**2, rel=0.1)
+
+
+def test_a_small_cup_in_a_photograph_keeps_the_resolution():
+    photo = np.pad(data.coffee()[::4, ::4], ((100, 100), (100, 100), (0, 0)), "edge")
+    opaque = torch.from_numpy(np.dstack([photo, np.full(photo.shape[:2], 255, np.uint8)])[None]).float() / 255
+    prepared = prepare_subject(opaque, False, SubjectSettings(size=64))
+    assert prepared.frame == photo.shape[:2] and prepared.crop.side >= 100
+    assert prepared.estimate.method == "network" and COARSE not in prepared.notes
+    left, _, right, _ = bounding_box(prepared.frames[..., 3])
+    assert right - left == pytest.approx(0.8 * 64, abs=3)
+
+
+class Forgetful:
+    """Network that finds what is dark in the three pictures of its first estimate, and nothing afterwards."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def probability(self, picture: Tensor) -> Tensor:
+        self.calls += 1
+        found = (picture.mean(-1) < 0.9).float()
+        return found if self.calls <= 3 else torch.zeros_like(found)
+
+
+def test_a_subject_that_is_not_found_again_from_close_is_kept_with_a_note():
+    network = Forgetful()
+    settings = SubjectSettings(size=64, matting="u2netp")
+    prepared = prepare_subject(small_disc(512, 32, 300), False, settings, segmenter=Segmenter("dark", lambda: network))
+    assert network.calls > 3 and COARSE in prepared.notes
+    assert prepared.frame == (128, 128)

@@ -65,17 +65,25 @@ def test_every_motion_is_a_video_that_moves(motion):
     assert (moving.alpha[3] - moving.alpha[0]).abs().mean() > 0.002
 
 
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_shortest_video_moves(motion):
+    fewest = WarpSettings.model_json_schema()["properties"]["frames"]["minimum"]
+    moving, notes = video(FIGURE, motion, frames=fewest)
+    assert notes == ()
+    assert (moving.frames[1] - moving.frames[0]).abs().max() > 0.1
+
+
 @pytest.mark.parametrize("motion", [m for m in MOTIONS if m != "turn"])
 @pytest.mark.parametrize("subject", [FIGURE, BUST])
 def test_the_first_frame_is_the_picture(motion, subject):
-    moving, _ = video(subject, motion, frames=2)
+    moving, _ = video(subject, motion, frames=3)
     white = torch.ones(3)
     expected = subject[..., :3] * subject[..., 3:] + 1 - subject[..., 3:]
     torch.testing.assert_close(moving.over(white)[0], expected, atol=0.012, rtol=0)
 
 
 def test_the_first_frame_of_a_turn_has_the_pictures_outline():
-    moving, _ = video(FIGURE, "turn", frames=2)
+    moving, _ = video(FIGURE, "turn", frames=3)
     assert (moving.alpha[0] - FIGURE[..., 3:]).abs().mean() < 0.01
 
 
