@@ -99,7 +99,10 @@ class WarpSettings(Settings):
     motion: Motion = Field("sway", description="weights-free motion, ours; further candidates use the other motions")
     strength: float = Field(1.0, gt=0, le=3, description="factor on the motion's amplitude")
     frames: int = Field(
-        14, ge=3, le=128, description="frames of a generated video (paper: 14); most motions are at rest at half a loop"
+        14,
+        ge=3,
+        le=128,
+        description="frames of a generated video (paper: 14); of two, the second shows most motions at rest again",
     )
     fps: float = Field(7.0, ge=0.01, le=120, description="frames per second of a generated video (paper: 7)")
 

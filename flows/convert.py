@@ -135,7 +135,7 @@ def convert_job(
         running(home.store(), job.item, job.given().values()),
         output_lock(folder, lambda: say(f"waiting for another run that writes {folder}")) as waited,
     ):
-        recover(folder)
+        recover(folder, say)
         if not force:
             check_folder(folder, job.item)
         if not (waited and is_current(folder, job.digest())):

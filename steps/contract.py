@@ -37,6 +37,7 @@ RUN_ONLY = frozenset(  # fields of a record that its digest leaves out
 )
 
 NO_LIST = {"list_type", "tuple_type"}  # errors of pydantic
+NUMBERS = re.compile(r"[-+.,0-9e ]{1,60}")  # one or several, with commas
 
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
@@ -178,7 +179,7 @@ def settings_errors(error: ValidationError, given: Any = None) -> str:
         name = _setting_name(each["loc"], given)  # empty if all settings together are refused
         value, message = each["input"], each["msg"].removeprefix("Value error, ")
         if name and each["type"] in NO_LIST:
-            items = value if isinstance(value, int | float | str) else "..."
+            items = value if NUMBERS.fullmatch(str(value)) else "..."
             lines.append(f"{name} = {quoted(value)} is not a list; write for example `--set '{name}=[{items}]'`")
         else:
             lines.append(f"{name} = {quoted(value)}: {message}" if name else message)

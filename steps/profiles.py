@@ -246,8 +246,9 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         for i, name in enumerate([*path, last]):
             if not isinstance(branch, dict) or name not in branch:
                 section, rest = key.split(".")[:i], key.split(".")[i:]
-                if kinds := _kinds_with(section, rest):
-                    raise BadInput(_other_kind(key, ".".join(section), kinds, branch["kind"]))
+                chosen = branch.get("kind") if isinstance(branch, dict) else None
+                if chosen and (kinds := _kinds_with(section, rest)):
+                    raise BadInput(_other_kind(key, ".".join(section), kinds, chosen))
                 known = ", ".join(sorted(branch)) if isinstance(branch, dict) else "nothing: it is a value"
                 raise BadInput(f"unknown setting {key!r}: {'.'.join(key.split('.')[:i]) or 'the pipeline'} has {known}")
             if i < len(path):

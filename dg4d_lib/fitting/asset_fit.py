@@ -6,6 +6,7 @@ open; accelerations, and displacements in depth and out of the plane of symmetry
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +61,12 @@ class AssetFit:
         self.unit = float((graph.nodes.amax(0) - graph.nodes.amin(0)).norm()) / 10
         self.basis = NodeBasis(graph, settings.smoothing, settings.integrate_rotations)
 
+    def with_graph(self, graph: ControlGraph) -> "AssetFit":
+        """Return the same fit of Gaussians that the nodes move by other weights."""
+        other = copy(self)
+        other.graph = graph
+        return other
+
     def match_first_frame(self, pose: Pose) -> Gaussians:
         """Fit colors, opacities and sizes to the first frame: light, texture and gaps differ from the video's.
 
@@ -112,12 +119,23 @@ class AssetFit:
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:
         """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
-        losses = self.picture_losses(motion, list(range(len(motion.shifts))))
+        return self.difference_of(motion.points(self.cloud.means, self.graph))
+
+    @torch.no_grad()
+    def difference_of(self, means: Float[Tensor, "t n 3"]) -> float:
+        """Return how much the Gaussians at these places and the video differ, over all frames."""
+        losses = self._picture_losses(means, list(range(len(means))))
         return float(losses["color"] + losses["alpha"])
+
+    @torch.no_grad()
+    def outline_errors(self, motion: NodeMotion) -> Float[Tensor, " t"]:
+        """Return the weighted loss of alpha at every frame."""
+        drawn = self._rendering(motion.points(self.cloud.means, self.graph)).alpha
+        return pyramid_residuals(drawn, self.alphas).square().sum(1) * (self.settings.alpha_weight / self.area)
 
     def residuals(self, motion: NodeMotion, frames: list[int]) -> Float[Tensor, "t r"]:
         """Return numbers per frame whose squares sum to the losses of color, alpha and shifts across the plane."""
-        settings, rendering = self.settings, self._rendering(motion)
+        settings, rendering = self.settings, self._rendering(motion.points(self.cloud.means, self.graph))
         parts = [
             math.sqrt(settings.color_weight / self.area) * pyramid_residuals(rendering.color, self.colors[frames]),
             math.sqrt(settings.alpha_weight / self.area) * pyramid_residuals(rendering.alpha, self.alphas[frames]),
@@ -149,7 +167,10 @@ class AssetFit:
 
     def picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of color and alpha of some frames."""
-        rendering = self._rendering(motion)
+        return self._picture_losses(motion.points(self.cloud.means, self.graph), frames)
+
+    def _picture_losses(self, means: Float[Tensor, "t n 3"], frames: list[int]) -> dict[str, Tensor]:
+        rendering = self._rendering(means)
         color = pyramid_error(rendering.color, self.colors[frames]) / self.area
         alpha = pyramid_error(rendering.alpha, self.alphas[frames]) / self.area
         return {"color": self.settings.color_weight * color, "alpha": self.settings.alpha_weight * alpha}
@@ -157,11 +178,10 @@ class AssetFit:
     @torch.no_grad()
     def silhouettes(self, motion: NodeMotion) -> Bool[Tensor, "t h w 1"]:
         """Return where the model is in the pictures."""
-        return self._rendering(motion).alpha > 0.5
+        return self._rendering(motion.points(self.cloud.means, self.graph)).alpha > 0.5
 
-    def _rendering(self, motion: NodeMotion) -> Rendering:
-        """Render the Gaussians at every moment of a motion."""
-        means = motion.points(self.cloud.means, self.graph)
+    def _rendering(self, means: Float[Tensor, "t n 3"]) -> Rendering:
+        """Render the Gaussians at places per frame."""
         count = len(means)
         states = replace(
             self.cloud,

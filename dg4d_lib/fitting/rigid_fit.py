@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from dg4d_lib.fitting.asset_fit import AssetFit
@@ -30,7 +30,10 @@ TOGETHER = 8  # frames whose derivatives are held in memory
 
 
 def fit_rigid_motion(
-    fit: AssetFit, start: RigidMotion, report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None
+    fit: AssetFit,
+    start: RigidMotion,
+    report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
+    hinge: Int[Tensor, " e"] | None = None,
 ) -> RigidMotion:
     """Fit the motions of rigid parts: pictures, a plane of symmetry that is kept, accelerations, joints.
 
@@ -38,9 +41,10 @@ def fit_rigid_motion(
         fit: what is compared.
         start: near the solution.
         report: called after every step with (steps done, named losses).
+        hinge: edges of the graph that alone hold the parts together; None: all between parts, weakly.
     """
     with torch.no_grad():
-        problem, found, damping = _Problem(fit, start), start, DAMPING
+        problem, found, damping = _Problem(fit, start, hinge), start, DAMPING
         held = 6 * len(start.centers) if fit.resting else 0  # variables of the first frame
         loss = problem.loss(found)
         for step in range(ITERATIONS):
@@ -65,10 +69,11 @@ def fit_rigid_motion(
 class _Problem:
     """Least squares over the variables of all parts and frames."""
 
-    def __init__(self, fit: AssetFit, start: RigidMotion) -> None:
+    def __init__(self, fit: AssetFit, start: RigidMotion, hinge: Int[Tensor, " e"] | None = None) -> None:
         self.fit, self.graph = fit, fit.graph
         ends = start.parts[self.graph.edges]
-        self.joints = torch.nonzero(ends[:, 0] != ends[:, 1])[:, 0]  # edges between parts
+        self.joints = torch.nonzero(ends[:, 0] != ends[:, 1])[:, 0] if hinge is None else hinge
+        self.joint_weight = JOINTS if hinge is None else 1.0
         self.deltas = [_differences(fit, start, part) for part in range(len(start.centers))]
 
     def loss(self, motion: RigidMotion) -> float:
@@ -116,7 +121,7 @@ class _Problem:
         stretch = torch.cat([(gaps - one) / lengths for one in turned], 1)
         size = stretch.norm(dim=-1, keepdim=True).clamp(min=1e-9)
         loss = robust(stretch, settings.rigidity_loss == "log").clamp(min=0)[..., None]
-        weight = math.sqrt(JOINTS * settings.rigidity / (2 * len(self.graph.edges)))
+        weight = math.sqrt(self.joint_weight * settings.rigidity / (2 * len(self.graph.edges)))
         return torch.cat([seen, (weight * loss.sqrt() / size * stretch).flatten(1)], 1)
 
     def _derivative(

@@ -4,6 +4,7 @@ Neighboring clusters of points are merged as long as one rigid motion fits both 
 (Ward 1963) by the error of rigid fits (Kabsch 1976), from the control nodes on.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,19 +78,47 @@ def find_rigid_parts(
     rest = torch.cat([graph.nodes, points]).double().numpy(force=True)
     bound = UNEXPLAINED**2 * np.square(moved - rest).sum()
     parts = _merged(_Moments.of(rest, moved, owners), graph.edges.numpy(force=True), float(bound))
-    count = int(parts.max()) + 1
-    if count > most:
+    if int(parts.max()) >= most:
         return None
-    moments = _Moments.of(rest, moved, parts[owners])
-    turns = Rotation.from_matrix(moments.rotations().reshape(-1, 3, 3)).as_quat(scalar_first=True)
-    quats = turns.reshape(count, -1, 4).swapaxes(0, 1)
-    places = moments.moved / moments.count[:, None, None]
-    return RigidMotion(
-        torch.from_numpy(parts).to(graph.indices),
-        torch.from_numpy(moments.rest / moments.count[:, None]).to(graph.nodes),
-        torch.from_numpy(quats.copy()).to(graph.nodes),
-        torch.from_numpy(places.swapaxes(0, 1).copy()).to(graph.nodes),
-    )
+    return _rigid(parts, _Moments.of(rest, moved, parts[owners]), graph)
+
+
+def two_rigid_parts(graph: ControlGraph, moved: Float[Tensor, "t v 3"]) -> RigidMotion | None:
+    """Return the two connected parts whose rigid motions are nearest to a motion of the points.
+
+    Args:
+        graph: with the weights of the points.
+        moved: points at every frame, world units; the first one is at rest.
+
+    Returns:
+        The part that moves less is number 0. None if the graph is not connected, or a node moves no point.
+    """
+    there = moved.double().numpy(force=True)
+    owners = graph.indices.gather(1, graph.weights.argmax(1, keepdim=True))[:, 0].numpy(force=True)
+    if len(np.unique(owners)) < len(graph.nodes):
+        return None
+    moments = _Moments.of(there[0], there, owners)
+    parts = _merged(moments, graph.edges.numpy(force=True), math.inf, fewest=2)
+    if int(parts.max()) != 1:
+        return None
+    moves = np.square(there - there[0]).sum(-1).mean(0)
+    if moves[parts[owners] == 0].mean() > moves[parts[owners] == 1].mean():
+        parts = 1 - parts
+    return _rigid(parts, _Moments.of(there[0], there, parts[owners]), graph)
+
+
+def of_one_part(graph: ControlGraph, parts: Int[Tensor, " m"], owners: Int[Tensor, " v"]) -> ControlGraph:
+    """Return a graph by which every point moves with one rigid part alone.
+
+    Args:
+        graph: nodes.
+        parts: of the nodes, from 0 on.
+        owners: part of every point.
+    """
+    first = functional.one_hot(parts).argmax(0)[owners]  # any node of a part moves as the part does
+    indices = first[:, None].expand(-1, graph.weights.shape[1])
+    weights = functional.one_hot(torch.zeros_like(owners), graph.weights.shape[1]).to(graph.weights)
+    return replace(graph, indices=indices, weights=weights)
 
 
 def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"]) -> ControlGraph:
@@ -102,17 +131,15 @@ def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int
         parts: of the nodes, from 0 on.
         pieces: connected piece of the surface that every point belongs to, from 0 on.
     """
-    members = functional.one_hot(parts)
-    shares = (members[graph.indices] * graph.weights[..., None]).sum(1)
+    shares = (functional.one_hot(parts)[graph.indices] * graph.weights[..., None]).sum(1)
     sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
     largest, owner = (sums / sums.sum(1, keepdim=True)).max(1)
     whole = (largest > NEARLY_ONE)[pieces, None]
-    first = members.argmax(0)[owner][pieces, None]  # any node of a part moves as the part does
-    alone = functional.one_hot(torch.zeros_like(pieces), graph.weights.shape[1]).to(graph.weights)
+    alone = of_one_part(graph, parts, owner[pieces])
     return replace(
         graph,
-        indices=torch.where(whole, first, graph.indices),
-        weights=torch.where(whole, alone, graph.weights),
+        indices=torch.where(whole, alone.indices, graph.indices),
+        weights=torch.where(whole, alone.weights, graph.weights),
     )
 
 
@@ -175,7 +202,20 @@ class _Moments:
         return self.cross - outer / self.count[:, None, None, None], self.squares - norms / self.count[:, None]
 
 
-def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float) -> Int[np.ndarray, " m"]:
+def _rigid(parts: Int[np.ndarray, " m"], moments: _Moments, graph: ControlGraph) -> RigidMotion:
+    """Return the rigid motions of the parts of the nodes that are nearest to what the sums over them are of."""
+    turns = Rotation.from_matrix(moments.rotations().reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    quats = turns.reshape(len(moments.count), -1, 4).swapaxes(0, 1)
+    places = moments.moved / moments.count[:, None, None]
+    return RigidMotion(
+        torch.from_numpy(parts).to(graph.indices),
+        torch.from_numpy(moments.rest / moments.count[:, None]).to(graph.nodes),
+        torch.from_numpy(quats.copy()).to(graph.nodes),
+        torch.from_numpy(places.swapaxes(0, 1).copy()).to(graph.nodes),
+    )
+
+
+def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float, fewest: int = 1) -> Int[np.ndarray, " m"]:
     """Merge neighboring clusters while the error of all stays below a bound; return the cluster of every node."""
     values = _Moments(*(array.copy() for array in vars(moments).values()))
     errors = values.errors()
@@ -190,8 +230,8 @@ def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float) -> I
             )
 
     compare(sorted({(min(pair), max(pair)) for pair in edges.tolist()}))
-    total = float(errors.sum())
-    while costs:
+    total, left = float(errors.sum()), len(errors)
+    while costs and left > fewest:
         kept, gone = pair = min(costs, key=lambda one: (costs[one], one))
         total += costs[pair]
         if total > bound:
@@ -200,6 +240,7 @@ def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float) -> I
             array[kept] += array[gone]
         errors[kept] += errors[gone] + costs[pair]
         clusters[clusters == gone] = kept
+        left -= 1
         ends = {node for other in costs if kept in other or gone in other for node in other} - {kept, gone}
         costs = {other: cost for other, cost in costs.items() if kept not in other and gone not in other}
         compare(sorted((min(kept, node), max(kept, node)) for node in ends))

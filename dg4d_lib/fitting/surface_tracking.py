@@ -15,7 +15,7 @@ from dg4d_lib.fitting.tracking_order import tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.mesh.extraction.topology import group_vertices
-from dg4d_lib.mesh.models.control_graph import build_control_graph
+from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
@@ -94,6 +94,24 @@ def track_surface(
     return [surface, *(replace(surface, vertices=vertices) for vertices in moved[1:])]
 
 
+def bind_vertices(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], settings: AssetSettings
+) -> tuple[Float[np.ndarray, "p 3"], ControlGraph, ControlGraph]:
+    """Return points on a surface, the graph that moves them, and the one that moves the vertices.
+
+    Args:
+        vertices: world units.
+        faces: of the surface.
+        settings: number of nodes, and how they are joined.
+    """
+    points = vertices.double().numpy()
+    first, index = group_vertices(points, CELL)
+    points, joined = points[first], index[faces.numpy()]
+    whole = (joined != np.roll(joined, 1, 1)).all(1)
+    graph = build_control_graph(points, joined[whole], settings.nodes, settings.tracking == "flow")
+    return points, graph, graph.of(torch.from_numpy(index))
+
+
 def track_vertices(
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -121,13 +139,8 @@ def track_vertices(
     Raises:
         FitDiverged: the loss became non-finite.
     """
-    points = vertices.double().numpy()
-    first, index = group_vertices(points, CELL)
-    points, joined = points[first], index[faces.numpy()]
-    whole = (joined != np.roll(joined, 1, 1)).all(1)
-    graph = build_control_graph(points, joined[whole], settings.nodes, settings.tracking == "flow")
+    points, graph, bound = bind_vertices(vertices, faces, settings)
     nearest = torch.from_numpy(np.asarray(cKDTree(points).query(gaussians.means.double().numpy())[1]))
-    bound = graph.of(torch.from_numpy(index))
     moved, done = vertices.repeat(len(video), 1, 1), 0
     for chosen in tracking_orders(video, reference_frame):
         if len(chosen) > 1:

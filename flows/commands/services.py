@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 POLL_S = 1.0  # between two scans of a watched folder
 RESULTS_EVERY_S = 5.0  # between two looks for finished packages
-OF_CATALOGS = "item-to-4d/"  # flow whose deployments only catalogs start
 FORM = "then choose Deployments, Picture to 4D, Run"
 OPEN_OWN = f"open this address first: it signs the browser in to the Prefect UI; {FORM}"
 OPEN_OTHER = f"open this address, the Prefect UI of $PREFECT_API_URL; {FORM}"
@@ -131,9 +130,10 @@ def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, qu
         server.start()
         server.keep()
     connect()
+    from flows.engine.item_runs import FLOW
     from flows.serving.registering import register
 
-    forms = [name for name in register(known, chosen) if not name.startswith(OF_CATALOGS)]
+    forms = [name for name in register(known, chosen) if not name.startswith(f"{FLOW}/")]  # catalogs start the others
     if forms and not quiet:
         typer.echo("deployments, forms that run from the Prefect UI:", err=True)
         for name in forms:

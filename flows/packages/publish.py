@@ -153,14 +153,19 @@ def leftovers(folder: Path) -> list[Path]:
     return left
 
 
-def recover(folder: Path) -> None:
-    """Clean up the `leftovers` of a folder: put its package or the user's files back, and remove the rest."""
+def recover(folder: Path, say: Say = lambda _: None) -> None:
+    """Clean up the `leftovers` of a folder: put its package or the user's files back, and remove the rest.
+
+    Args:
+        folder: output folder.
+        say: as of `publish`.
+    """
     folder = folder.resolve()
     for left in leftovers(folder):
         if left.name.startswith(f".{folder.name}.incoming"):
             remove_tree(left)
         elif folder.exists():
-            _carry_over(left, folder)
+            _carry_over(left, folder, say)
         else:
             left.replace(folder)
 
@@ -193,7 +198,7 @@ def _publish(package: Path, folder: Path, finish: Finish, say: Say, in_place: bo
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
-    recover(folder)
+    recover(folder, say)
     staging = place / f".{folder.name}.incoming-{os.getpid()}"
     before = staging.with_name(f".{folder.name}.outgoing-{os.getpid()}")
     remove_tree(staging)
@@ -249,7 +254,7 @@ def _swap(staging: Path, folder: Path, before: Path) -> None:
         raise
 
 
-def _carry_over(outgoing: Path, folder: Path, say: Say = lambda _: None) -> None:
+def _carry_over(outgoing: Path, folder: Path, say: Say) -> None:
     """Move the user's files over from the folder of an earlier package, and remove that."""
     knows_its_own = record_of(outgoing) is not None  # else `_move_in` was interrupted, and these may be of a package
     for name in sorted(_foreign(outgoing), key=lambda name: (folder / name).exists()):  # names that stay first
@@ -270,12 +275,17 @@ def _set_aside(path: Path, folder: Path, name: Path, say: Say) -> None:
 
 def _free_name(folder: Path, name: Path) -> Path:
     """Return a name, or a similar one if it is taken, or if a file has the name of a folder above it."""
-    taken = next((up for up in reversed(name.parents) if (folder / up).is_file()), name)
-    if taken == name and not (folder / name).exists():
+    if _is_free(folder, name):
         return name
+    taken = next((up for up in reversed(name.parents) if (folder / up).is_file()), name)
     numbered = (f".mine{'' if number == 1 else f'-{number}'}" for number in itertools.count(1))
-    others = (taken.with_name(f"{taken.stem}{mark}{taken.suffix}") for mark in numbered)
-    return next(other for other in others if not (folder / other).exists()) / name.relative_to(taken)
+    others = (taken.with_name(f"{taken.stem}{mark}{taken.suffix}") / name.relative_to(taken) for mark in numbered)
+    return next(other for other in others if _is_free(folder, other))
+
+
+def _is_free(folder: Path, name: Path) -> bool:
+    """Return true if nothing has the name, and no file that of a folder above it."""
+    return not (folder / name).exists() and not any((folder / up).is_file() for up in name.parents)
 
 
 def _move_in(staging: Path, folder: Path, before: Path, say: Say) -> None:

@@ -184,7 +184,8 @@ class Draft:
         try:
             with Image.open(io.BytesIO(content), formats=["PNG"]) as picture:
                 if max(picture.size) > MASK_SIDES:
-                    raise BadInput(f"the mask has {picture.size} pixels; its sides have at most {MASK_SIDES}")
+                    width, height = picture.size
+                    raise BadInput(f"the mask has {width} x {height} pixels; its sides may have at most {MASK_SIDES}")
                 drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise BadInput("the mask is no PNG that can be read; draw it again") from error

@@ -10,6 +10,7 @@ import torch
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import Report
+from dg4d_lib.fitting.hinge_tracking import HINGE_ITERATIONS, track_hinge
 from dg4d_lib.fitting.surface_tracking import (
     DESCENT,
     LOST,
@@ -66,15 +67,16 @@ def most_iterations(known: Bank, video: DrivingVideo, trackings: int) -> int:
     """Return the largest number of iterations that a `SurfaceTracker` reports."""
     first = tracking_of(known)
     more = (SWING,) if first is FLOW else OTHERS if trackings > 1 else ()  # hulls of few pictures are seldom lost
-    return sum(tracking_iterations(settings, video) for settings in (first, *more))
+    return sum(tracking_iterations(settings, video) for settings in (first, *more)) + HINGE_ITERATIONS
 
 
 class SurfaceTracker:
     """Moves the surface of known views of the first frame as the video shows it.
 
-    A surface that loses the outline, or that flow follows badly, is tracked a second time, with limbs that swing;
-    `swinging_is_better` chooses between the two motions. Hulls of few pictures are then tracked in two more ways, whose
-    errors at unseen sides differ: softer and stiffer where limbs swing, else by flow and with limbs that swing.
+    If the motion is that of a lid or a door on a hinge, the fit of the hinge is the answer. Else a surface that loses
+    the outline, or that flow follows badly, is tracked a second time, with limbs that swing; `swinging_is_better`
+    chooses between the two motions. Hulls of few pictures are then tracked in two more ways, whose errors at unseen
+    sides differ: softer and stiffer where limbs swing, else by flow and with limbs that swing.
     """
 
     def __init__(
@@ -97,7 +99,7 @@ class SurfaceTracker:
         self._first = tracking_of(known)
         self._several = trackings > 1 and self._first is SOFT
         self._most, self._report = most_iterations(known, video, trackings), report
-        self._numbers, self._done = count(), [0] * (2 + len(OTHERS))  # iterations of every tracking
+        self._numbers, self._done = count(), [0] * (3 + len(OTHERS))  # iterations of every tracking
         self._here = threading.get_ident()  # callbacks of a job belong to its thread
 
     def __call__(self, surface: InflatedSurface) -> Tracked:
@@ -111,6 +113,8 @@ class SurfaceTracker:
             share = CARRIED_BESIDE_SEVERAL if self._several else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
+            if overlap >= LOST and (hinged := self._on_a_hinge(moved)):
+                return Tracked([hinged], CARRIED_SHARE)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
                 if not swinging_is_better(overlap, self._overlap(second)):
@@ -130,6 +134,19 @@ class SurfaceTracker:
         return [found[way] for way in range(len(ways))]
 
     def _follow(self, surface: InflatedSurface, settings: AssetSettings, generator: torch.Generator) -> MovedSurfaces:
+        return MovedSurfaces(
+            track_surface(
+                surface, self._gaussians, self._video, self._rasterize, settings, generator, self._next_report()
+            )
+        )
+
+    def _on_a_hinge(self, free: MovedSurfaces) -> MovedSurfaces | None:
+        surfaces = [free.surface(frame) for frame in range(len(self._video))]
+        found = track_hinge(surfaces, self._gaussians, self._video, self._rasterize, SOFT, self._next_report())
+        return MovedSurfaces(found) if found else None
+
+    def _next_report(self) -> Report:
+        """Return what one more fit reports its iterations to."""
         number = next(self._numbers)
 
         def told(iteration: int, values: dict[str, float]) -> None:
@@ -137,9 +154,7 @@ class SurfaceTracker:
             if threading.get_ident() == self._here:
                 self._report(min(sum(self._done), self._most), values)
 
-        return MovedSurfaces(
-            track_surface(surface, self._gaussians, self._video, self._rasterize, settings, generator, told)
-        )
+        return told
 
     def _overlap(self, moved: MovedSurfaces) -> float:
         """Return the intersection over union of silhouettes at the input view, mean over frames."""

@@ -40,6 +40,7 @@ def find_channels(spec: oiio.ImageSpec, depth: bool = False) -> Channels:
     layer = max(colored or layers, key=rank)  # the first one of equals
     ends = layers[layer]
     alpha = spec.alpha_channel if spec.alpha_channel in ends else _with_end(ends, "a")
+    alpha = alpha if alpha >= 0 else _with_end(layers.get("", {}), "a")  # of the picture, beside layers of colors
     found = _depth_channel(names) if depth else -1
     if found >= 0:
         colors, is_one_of_several = [found] * 3, False

@@ -1,5 +1,6 @@
 """Still picture reader on OpenImageIO, and on Pillow for AVIF: any format, depth and mode, as straight RGBA in sRGB."""
 
+import math
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,7 +109,7 @@ def read_still(path: Path, what: str, limit: DecodeLimit, longest: int = LARGEST
         spec = file.spec()
         _check_kind(file, what)
         still = _Still(file, what)
-        limit.require(still.needed_bytes(held), what, still.width, still.height)
+        still.require_memory(limit, held)
         shrinker = BandDownscaler(still.height, still.width, longest)
         for top, band in still.bands():
             shrinker.add(top, torch.from_numpy(band))
@@ -159,7 +160,7 @@ def read_values(path: Path, what: str, limit: DecodeLimit, height: int, width: i
         spec = file.spec()
         _check_kind(file, what)
         still = _Still(file, what, depth=True)
-        limit.require(still.needed_bytes(held), what, still.width, still.height)
+        still.require_memory(limit, held)
         orientation = int(spec.get_int_attribute("Orientation", 1))
         if orientation in TRANSPOSED:
             height, width = width, height
@@ -350,6 +351,16 @@ class _Still:
         if self._file.format_name() == "openexr" or block * widest * spec.pixel_bytes(True) <= BAND_BYTES:
             rows = -(-rows // block) * block
         return min(rows, max(self.height, spec.height))
+
+    def require_memory(self, limit: DecodeLimit, held: float) -> None:
+        """Refuse a picture that takes too much memory; the message has the size of its larger window.
+
+        Args:
+            limit: memory that is allowed.
+            held: bytes per pixel that the decoder holds, as far as the header tells.
+        """
+        windows = (self.width, self.height), (self._spec.width, self._spec.height)
+        limit.require(self.needed_bytes(held), self._what, *max(windows, key=math.prod))
 
     def needed_bytes(self, held: float) -> float:
         """Return an estimate of the memory of the decoder, a band, its copies and the result.

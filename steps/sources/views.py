@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dg4d_lib.errors import BadInput, quoted
 from steps.artifacts.archives import stays_inside
@@ -20,6 +20,7 @@ CLOSE_DEG = 2.0  # two views nearer to each other count as one
 HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth says nothing
 OTHER_SHAPE = 0.02  # ratio of width to height by which picture and camera may differ: rounding after shrinking
 DISTORTED = 0.05  # largest lens distortion coefficient that is ignored
+Side = Annotated[int, Field(gt=0, le=1_000_000)]  # of a picture, pixels
 
 
 class PlacedCamera(Frozen):
@@ -35,7 +36,7 @@ class PlacedCamera(Frozen):
     matrix: tuple[tuple[float, float, float, float], ...]
     focal: float = Field(gt=0)
     center: tuple[float, float] = (0.5, 0.5)
-    size: tuple[PositiveInt, PositiveInt] | None = None
+    size: tuple[Side, Side] | None = None
 
     def check_shape(self, size: tuple[int, int], name: str) -> None:
         """Refuse a picture of another shape than that of the camera: its focal length would be wrong.
@@ -180,8 +181,8 @@ class _Intrinsics(_Loose):
     fl_x: float | None = Field(None, gt=0)
     cx: float | None = None
     cy: float | None = None
-    w: int | None = Field(None, gt=0)
-    h: int | None = Field(None, gt=0)
+    w: Side | None = None
+    h: Side | None = None
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0

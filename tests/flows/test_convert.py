@@ -42,12 +42,12 @@ def request_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str
 
 
 def collected() -> list[str]:
-    """What a garbage collection without grace removes now."""
+    """Collect garbage without grace; return the digests of what was removed."""
     return [entry.name for entry in collect(home.store(), home.records(), grace_s=0).artifacts]
 
 
 def age(ref: ArtifactRef) -> None:
-    """As if the artifact had been stored by an earlier process."""
+    """Date an artifact back, as if an earlier process had stored it."""
     os.utime(home.store().root / object_name(ref.digest), (1, 1))
 
 

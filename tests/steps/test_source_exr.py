@@ -124,6 +124,10 @@ def test_the_limits_count_both_windows(tmp_path, monkeypatch):
     large = save(tmp_path / "b.exr", flat(130, 96, *RED, 1), "R G B A")
     with pytest.raises(BadInput, match=r"stores 130 x 96 pixels in its data window"):
         read(large)
+    monkeypatch.undo()
+    wide = save(tmp_path / "c.exr", flat(4096, 4, *RED, 1), "R G B A")
+    with pytest.raises(BadInput, match=r"the picture is 4096 x 4 pixels and takes"):
+        stills.read_still(wide, "the picture", DecodeLimit(2e-4))
 
 
 COMBINED = "View.Combined.R View.Combined.G View.Combined.B"
@@ -150,6 +154,12 @@ def test_colors_and_alpha_are_those_of_one_layer(tmp_path, names, values, layer)
     source = read(save(tmp_path / "a.exr", flat(*SHOWN, *values), names))
     torch.testing.assert_close(source.frames[0, 30, 30], torch.tensor([0.7354, 0, 0, 1]), atol=1e-3, rtol=0)
     assert [f"'{layer}'" in note for note in source.notes] == [True] * bool(layer)
+
+
+def test_layers_of_colors_have_the_alpha_beside_them(tmp_path):
+    path = save(tmp_path / "a.exr", flat(*SHOWN, 0.25, 0, 0, 0.5), "View.R View.G View.B A")
+    source = read(path)
+    torch.testing.assert_close(source.frames[0, 30, 30], torch.tensor([0.7354, 0, 0, 0.5]), atol=1e-3, rtol=0)
 
 
 def test_depth_is_read_beside_layers_of_colors(tmp_path):

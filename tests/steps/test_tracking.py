@@ -85,25 +85,54 @@ def test_how_a_surface_is_tracked_depends_on_how_it_keeps_the_outline(
         return [surface, *(replace(surface, vertices=surface.vertices + shift) for _ in range(FRAMES - 1))]
 
     monkeypatch.setattr(tracking, "track_surface", track)
+    monkeypatch.setattr(tracking, "track_hinge", lambda *_: None)
     monkeypatch.setattr(workers, "thread_count", lambda: 1)  # one after the other
-    points = torch.zeros(1, 3)
-    cloud = Gaussians(points, points, torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1), torch.zeros(1, 1, 3))
     video, known = video_of([0.0] * FRAMES), views(azimuths_deg)
-    follow = SurfaceTracker(
-        cloud,
-        video,
-        known,
-        get_rasterizer("auto"),
-        torch.Generator(),
-        trackings,
-        lambda iteration, values: told.append(iteration),
-    )
+    follow = tracker(video, known, trackings, lambda iteration, values: told.append(iteration))
     moved = [one.surface(1).vertices[:, 0].mean().item() for one in follow(ball(0.0)).guesses]
     assert done == list(errors)
     assert moved == pytest.approx([errors[name] for name in kept], abs=1e-5)
     most = most_iterations(known, video, trackings)
     ends = accumulate(tracking_iterations(WAYS[name], video) for name in errors)
     assert told == [min(end, most) for end in ends]
+
+
+def tracker(video: DrivingVideo, known: Bank, trackings: int, report: Report) -> SurfaceTracker:
+    """Return a tracker of a cloud of one Gaussian."""
+    points = torch.zeros(1, 3)
+    cloud = Gaussians(points, points, torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1), torch.zeros(1, 1, 3))
+    return SurfaceTracker(cloud, video, known, get_rasterizer("auto"), torch.Generator(), trackings, report)
+
+
+@pytest.mark.parametrize(("shift", "asked"), [(0.0, True), (0.03, True), (0.2, False)])  # the last loses the outline
+@pytest.mark.parametrize("azimuths_deg", [[90, 180], ALL_AROUND])
+def test_a_hinge_that_is_found_replaces_all_other_trackings(
+    monkeypatch: pytest.MonkeyPatch, shift: float, asked: bool, azimuths_deg: list[float]
+) -> None:
+    done, told = list[str](), list[int]()
+
+    def follow(surface: InflatedSurface, *_: object) -> list[InflatedSurface]:
+        done.append("free")
+        moved = replace(surface, vertices=surface.vertices + torch.tensor([shift, 0, 0]))
+        return [surface, *[moved] * (FRAMES - 1)]
+
+    def hinge(free: list[InflatedSurface], *others: object) -> list[InflatedSurface]:
+        done.append("hinge")
+        report = others[-1]
+        assert callable(report)
+        report(3, {"rigid parts": 1.0})
+        return [free[0], *[ball(0.01)] * (FRAMES - 1)]
+
+    monkeypatch.setattr(tracking, "track_surface", follow)
+    monkeypatch.setattr(tracking, "track_hinge", hinge)
+    video = video_of([0.0] * FRAMES)
+    tracked = tracker(video, views(azimuths_deg), 1, lambda iteration, values: told.append(iteration))(ball(0.0))
+    assert ("hinge" in done) == asked
+    assert told == ([3] if asked else [])
+    if asked:
+        assert done == ["free", "hinge"]
+        (guess,) = tracked.guesses
+        torch.testing.assert_close(guess.surface(1).vertices, ball(0.01).vertices)
 
 
 def test_trackings_tell_the_iterations_of_both_halves_of_a_loop() -> None:

@@ -55,7 +55,7 @@ class BaseColors:
         texture, uvs, wrap = self._texture(info, attributes)
         colors = None
         if "COLOR_0" in attributes and not glows:
-            colors = read_accessor(self.reader, attributes["COLOR_0"])[:, :3].astype(np.float64)
+            colors = _finite(read_accessor(self.reader, attributes["COLOR_0"])[:, :3])
         masked = material.get("alphaMode", "OPAQUE") != "OPAQUE" and not glows
         return BaseColor(uvs, texture, (factor[0], factor[1], factor[2]), colors, masked, wrap)
 
@@ -77,11 +77,12 @@ class BaseColors:
             return None, None, REPEATED
         if source not in self.pictures:
             self.pictures[source] = self._picture(source)
-        uvs = read_accessor(self.reader, attributes[name]).astype(np.float64)
+        uvs = _finite(read_accessor(self.reader, attributes[name]))
         turn = float(transform.get("rotation", 0))
         c, s = math.cos(turn), math.sin(turn)
         uvs = (uvs * transform.get("scale", (1, 1))) @ np.array([[c, -s], [s, c]]) + transform.get("offset", (0, 0))
-        sampler = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
+        number, samplers = texture.get("sampler"), tree.get("samplers", ())
+        sampler = samplers[number] if isinstance(number, int) and 0 <= number < len(samplers) else {}  # as players do
         return self.pictures[source], uvs, (_wrap(sampler.get("wrapS")), _wrap(sampler.get("wrapT")))
 
     def _picture(self, index: int) -> NDArray[np.uint8]:
@@ -125,6 +126,11 @@ def _emitted(material: dict[str, Any]) -> list[float]:
     """Return the factor of the light that a material emits, linear, at most 1."""
     strength = json_object(json_object(material.get("extensions")).get(STRENGTH)).get("emissiveStrength", 1)
     return [min(1.0, float(value) * float(strength)) for value in material.get("emissiveFactor", (0, 0, 0))]
+
+
+def _finite(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return float64 with 0 in place of NaN and infinity, which would spread to the colors of all that is near."""
+    return np.nan_to_num(values.astype(np.float64), posinf=0.0, neginf=0.0)
 
 
 def _wrap(number: Any) -> Wrap:

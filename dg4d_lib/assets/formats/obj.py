@@ -16,7 +16,7 @@ Read = Callable[[str], bytes | None]  # content of a file beside the model, by i
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 _CONTINUED = re.compile(r"\\\r?\n")  # a backslash at the end of a line
 FLOAT_COLORS = 2.0  # largest color of a file with floats, which may exceed 1 a little; others have colors of 0 to 255
-MOST_NAMED = 5  # materials in a note
+MOST_NAMED = 5  # materials or files in a note
 _NAMING = ("o", "g", "usemtl", "mtllib")  # statements of names, where "#" begins no comment
 
 
@@ -136,15 +136,16 @@ class _Content:
             known = self.materials.get(group.material, unknown)
             texture = read_texture(known.textures, self.read, decode, pictures)
             parts.append(_part(group, points, coordinates, colored, known, texture))
-        return single_precision(parts, self.notes())
+        return single_precision(parts, self.notes() if colored is None else ())
 
     def notes(self) -> list[str]:
-        """Return a sentence about materials that are missing."""
+        """Return a sentence about materials that are missing, and therefore gray."""
         named = {group.material for group in self.groups.values()} - {""}
         missing = sorted(named - set(self.materials))
         if not missing:
             return []
-        files = f"; MTL files that are missing beside the model: {', '.join(self.absent)}" if self.absent else ""
+        absent = _listed(list(dict.fromkeys(self.absent)))
+        files = f"; MTL files that are missing beside the model: {absent}" if absent else ""
         return [f"no color was found for the materials {_listed(missing)}{files}"]
 
 

@@ -1,6 +1,7 @@
 """PLY container: elements of scalars and lists, ASCII or binary (Turk 1994)."""
 
 import warnings
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4"
 TYPES |= {"float": "f4", "double": "f8", "float16": "f2", "float32": "f4", "float64": "f8"}
 TYPES |= {f"{sign}int{bits}": f"{sign or 'i'}{bits // 8}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+MOST_UNEVEN = 2_000_000  # rows of an element whose lists differ in length: they are read one by one, and slowly
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,12 @@ class Element:
     lists: dict[str, List]
 
 
-def read_elements(content: bytes) -> dict[str, Element]:
-    """Read all elements of a PLY.
+def read_elements(content: bytes, needed: Collection[str]) -> dict[str, Element]:
+    """Read the elements of a PLY up to the last needed one.
 
     Raises:
-        ValueError, IndexError, OverflowError: the file is no PLY, or it is broken or truncated.
+        ValueError, IndexError, OverflowError: the file is no PLY, it is broken or truncated, or an element has too many
+            rows of different lengths.
     """
     end = content.index(b"end_header")
     start = content.index(b"\n", end) + 1
@@ -70,6 +73,8 @@ def read_elements(content: bytes) -> dict[str, Element]:
             case ["format", name, _]:
                 form = name
             case ["element", name, count] if count.isdecimal():
+                if any(name == other for other, _, _ in declared):
+                    raise ValueError(f"the header declares the element {name[:80]!r} twice")
                 declared.append((name, int(count), []))
             case ["property", "list", counted, kind, name]:
                 declared[-1][2].append(Property(name, _kind(kind), _kind(counted)))
@@ -80,7 +85,8 @@ def read_elements(content: bytes) -> dict[str, Element]:
     if form not in ("ascii", *ORDERS):
         raise ValueError(f"the format is {form!r}")
     rows = _Numbers(content[start:]) if form == "ascii" else _Bytes(content[start:], ORDERS[form])
-    return {name: _element(rows, name, count, properties) for name, count, properties in declared}
+    last = max((number for number, (name, _, _) in enumerate(declared) if name in needed), default=-1)
+    return {name: _element(rows, name, count, properties) for name, count, properties in declared[: last + 1]}
 
 
 def _kind(name: str) -> str:
@@ -100,10 +106,14 @@ def _element(rows: "_Numbers | _Bytes", name: str, count: int, properties: list[
             rows.place = start
             columns = rows.table(count, properties, lengths)
             if columns is None:
+                if count > MOST_UNEVEN:
+                    raise ValueError(
+                        f"{name[:80]!r} has {count} rows of different lengths; at most {MOST_UNEVEN} are read"
+                    )
                 rows.place = start
                 columns = _joined([rows.row(properties) for _ in range(count)])
     except IndexError as error:
-        raise ValueError(f"the rows of {name!r} are truncated") from error
+        raise ValueError(f"the rows of {name[:80]!r} are truncated") from error
     scalars = {one.name: values for one, (values, _) in zip(properties, columns, strict=True) if not one.counted}
     lists = {one.name: List(*pair) for one, pair in zip(properties, columns, strict=True) if one.counted}
     return Element(scalars, lists)

@@ -62,7 +62,7 @@ def read_ply_mesh(content: bytes, read: Read, decode: Decode, max_faces: int) ->
     if _WIDE_COLORS.search(header_text(content)):
         raise BadInput("the PLY has colors of 16 bits; export it with colors of 8 bits, or as GLB")
     try:
-        elements = read_elements(content)
+        elements = read_elements(content, ("vertex", "face"))
         return single_precision([_part(elements, max_faces, texture_file(content), read, decode)])
     except _BROKEN as error:
         raise BadInput(f"the PLY cannot be read ({error}); export it again, or as GLB") from error

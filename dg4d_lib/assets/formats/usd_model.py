@@ -21,6 +21,7 @@ from dg4d_lib.mesh.models.polygons import triangulate
 MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
 GRAY = (0.5, 0.5, 0.5)  # of a material without a readable color, linear
 MOST_NAMED = 5  # objects in a note
+_BROKEN = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError)  # the last one by pxr
 
 
 def check_usdz(path: Path) -> None:
@@ -91,7 +92,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
             if prim.IsA(UsdGeom.Gprim):
                 others.append(f"{prim.GetTypeName()} {prim.GetName()[:80]!r}")
             continue
-        found = list(_parts(UsdGeom.Mesh(prim), time, cache, upright, materials))
+        found = _parts(UsdGeom.Mesh(prim), time, cache, upright, materials)
         parts += found
         faces += sum(len(part.faces) for part in found)
         if faces > max_faces:
@@ -130,8 +131,24 @@ def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:
 
 def _parts(
     mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], materials: UsdMaterials
+) -> list[ModelPart]:
+    """Return a part for every material of a mesh.
+
+    Raises:
+        BadInput: attributes of the mesh or of its material have values of another type, or do not fit each other.
+    """
+    try:
+        return list(_parts_by_material(mesh, time, cache, upright, materials))
+    except _BROKEN as error:
+        raise BadInput(
+            f"the mesh {mesh.GetPrim().GetName()[:80]!r} of the USD file or its material cannot be read ({error}); "
+            "export it again"
+        ) from error
+
+
+def _parts_by_material(
+    mesh: UsdGeom.Mesh, time: Any, cache: Any, upright: NDArray[np.float64], materials: UsdMaterials
 ) -> Iterator[ModelPart]:
-    """Return a part for every material of a mesh."""
     prim = mesh.GetPrim()
     points = np.array(mesh.GetPointsAttr().Get(time) or [], float).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)

@@ -9,7 +9,7 @@ from dg4d_lib.mesh.subprocess_runner import Arrays, run_in_subprocess
 from dg4d_lib.settings import MeshSettings
 
 PROGRAM = "dg4d_lib.mesh.extraction.pymeshlab_program"
-SHRUNK = 0.5  # diagonal of the bounding box, relative to that before, below which the surface counts as collapsed
+SHRUNK = 0.5  # diagonal of the bounding box, relative to that of the largest component before: below, it collapsed
 
 
 def clean(
@@ -41,16 +41,17 @@ def clean(
         "edge_length": np.array(length),
         "max_faces": np.array(settings.max_faces),
     }
+    largest, _ = drop_small_components(arrays["vertices"], arrays["faces"], 1.0)
     cleaned = run_in_subprocess(PROGRAM, "clean the mesh", arrays)
     vertices, faces = drop_small_components(cleaned["vertices"], cleaned["faces"], settings.min_component)
     if len(faces) == 0:
         raise DG4DError("mesh cleaning left no faces; raise mesh.grid or lower mesh.edge_length")
-    share = _diagonal(vertices) / _diagonal(arrays["vertices"])
+    share = _diagonal(cleaned["vertices"]) / _diagonal(largest)  # small components may vanish or be dropped
     if share < SHRUNK:
+        advice = "lower mesh.edge_length" if length <= settings.edge_length else "raise mesh.max_faces"
         raise DG4DError(
             f"mesh cleaning shrank the surface to {share:.1%} of its size, at least {SHRUNK:.0%} is allowed: edges of "
-            f"{length:.3g} units of the normalized box are too long for it; raise mesh.grid or "
-            "mesh.max_faces, or lower mesh.edge_length"
+            f"{length:.3g} units of the normalized box are too long for it; {advice}"
         )
     return (vertices * unit).astype(np.float32), orient_outward(vertices, faces).astype(np.int32)
 

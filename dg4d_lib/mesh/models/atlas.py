@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import TRANSPARENT, Model, ModelPart
-from dg4d_lib.mesh.models.tiles import GUTTER, SMALLEST_TILE, draw_tile, split_by_tile
+from dg4d_lib.mesh.models.tiles import GUTTER, SMALLEST_TILE, draw_tile, full_size, split_by_tile
 from dg4d_lib.mesh.textured import TexturedMesh
 
 BLOCK = 2  # texels per side of the colors of a triangle
@@ -26,8 +26,8 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
 
     Args:
         model: parts with materials.
-        texture_size: largest side of the texture, unless it has many tiles or plain triangles; a single texture keeps
-            its own size below that.
+        texture_size: largest side of the texture, unless it has many tiles or plain triangles; a single texture, with
+            its repetitions, keeps its own size below that.
 
     Raises:
         BadInput: masks hide all triangles.
@@ -40,7 +40,7 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
     columns = max(1, math.ceil(math.sqrt(len(textured))))
     blocks = sum(len(part.faces) for part, _ in parts if not _has_tile(part))
     rows = math.ceil(len(textured) / columns)
-    largest = max((max(part.texture.shape[:2]) for part in textured if part.texture is not None), default=1)
+    largest = max(map(full_size, textured), default=1)
     tile = max(min(texture_size // columns, max(largest, 16) + 2 * GUTTER), SMALLEST_TILE) if textured else 0
     width = max(columns * tile, BLOCK * math.ceil(math.sqrt(blocks)), 16)
     per_row = width // BLOCK

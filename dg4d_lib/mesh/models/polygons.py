@@ -1,4 +1,4 @@
-"""Triangulation of polygons: convex ones as fans, concave ones by ear clipping (Meisters 1975)."""
+"""Triangulation of polygons: as fans where these fit, else by ear clipping (Meisters 1975)."""
 
 from typing import no_type_check
 
@@ -11,7 +11,7 @@ from dg4d_lib.kernels.compiling import configure_numba
 configure_numba()
 
 MOST_CORNERS = 1024  # of a polygon whose ears are cut; larger ones become fans, since the time grows with the square
-STRAIGHT = 1e-6  # area at a corner, as a share of the polygon's, up to which the corner counts as straight
+EMPTY = 1e-6  # area of a triangle, as a share of the polygon's, up to which its orientation does not count
 CHUNK = 2**18  # corners of polygons that are looked at together, which bounds the memory
 
 
@@ -38,18 +38,21 @@ def triangulate(
         same = np.flatnonzero(counts == count)
         step = max(1, CHUNK // int(count))
         for some in (same[start : start + step] for start in range(0, len(same), step)):
-            flat, concave = _flattened(points[indices[corners[some, None] + np.arange(count)]])
-            chosen = some[concave]
+            flat, folded = _flattened(points[indices[corners[some, None] + np.arange(count)]])
+            chosen = some[folded]
             if len(chosen):
                 rows = first[chosen, None] + np.arange(count - 2)
-                found[rows] = corners[chosen, None, None] + _cut_ears(flat[concave])
+                found[rows] = corners[chosen, None, None] + _cut_ears(flat[folded])
     return found
 
 
 def _flattened(
     corners: Float[np.ndarray, "p n 3"],
 ) -> tuple[Float[np.ndarray, "p n 2"], Bool[np.ndarray, " p"]]:
-    """Return polygons in the plane of their Newell normal, counter-clockwise, and which of them are concave."""
+    """Return polygons in the plane of their Newell normal, counter-clockwise, and whose fans have inverted triangles.
+
+    The first corner is the origin of the plane.
+    """
     with np.errstate(all="ignore"):  # polygons without area, and numbers that are not finite, become fans
         relative = corners - corners[:, :1]
         normals = 0.5 * np.cross(relative, np.roll(relative, -1, 1)).sum(1)
@@ -60,9 +63,9 @@ def _flattened(
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         up = np.cross(axis, right)
         flat = np.stack([np.einsum("pnc,pc->pn", relative, way) for way in (right, up)], -1)
-        edges = np.roll(flat, -1, 1) - flat
-        turns = 0.5 * (np.roll(edges[..., 0], 1, 1) * edges[..., 1] - np.roll(edges[..., 1], 1, 1) * edges[..., 0])
-        return flat, (turns < -STRAIGHT * areas[:, None]).any(1)
+        x, y = flat[..., 0], flat[..., 1]
+        fan = 0.5 * (x[:, :-1] * y[:, 1:] - y[:, :-1] * x[:, 1:])
+        return flat, (fan < -EMPTY * areas[:, None]).any(1)
 
 
 @njit(cache=True, nogil=True)

@@ -32,8 +32,7 @@ def split_by_tile(part: ModelPart) -> list[ModelPart]:
     if fits.any():
         near = replace(part, faces=part.faces[fits])
         found.append(replace(near, faces=near.faces[_shown(near)]))
-    mean = _mean(part)
-    if mean is not None and not fits.all():
+    if not fits.all() and (mean := _mean(part)) is not None:
         red, green, blue = map(float, np.array(part.factor) * mean)
         found.append(
             replace(part, faces=part.faces[~fits], uvs=None, texture=None, factor=(red, green, blue), masked=False)
@@ -53,6 +52,13 @@ def local_uvs(part: ModelPart) -> Float[np.ndarray, "f 3 2"]:
             outside = (low >= 1) | (high <= 0)
             local[outside, :, axis] = local[outside, :, axis].clip(0, 1)
     return local
+
+
+def full_size(part: ModelPart) -> int:
+    """Return the texels per side that the repetitions of a part's texture have at its own size."""
+    assert part.texture is not None  # the caller has looked
+    low, high = _window(local_uvs(part))
+    return int(((high - low) * part.texture.shape[1::-1]).max())
 
 
 def draw_tile(part: ModelPart, size: int) -> tuple[UInt8[np.ndarray, "s s 3"], Float[np.ndarray, "f 3 2"]]:

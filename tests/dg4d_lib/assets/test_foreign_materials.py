@@ -60,6 +60,13 @@ def test_textures_go_on_by_the_wrap_mode_of_their_sampler(mode: int | None, expe
         assert one.parts[0].wrap == model.parts[0].wrap and one.parts[0].wrap[1] is Wrap.REPEAT
 
 
+@pytest.mark.parametrize("number", [7, -1, "no number"])
+def test_a_sampler_that_does_not_exist_repeats(number: object) -> None:
+    document = square(1.0, {"wrapS": int(Wrap.CLAMP)})
+    document.tree["textures"][0]["sampler"] = number
+    np.testing.assert_allclose(color(read(document).model), RED, atol=1e-5)
+
+
 def test_textures_of_one_picture_and_two_wrap_modes_keep_both() -> None:
     repeated, mirrored = (read(square(1.0, {"wrapS": mode})).model.parts[0] for mode in (10497, 33648))
     parts = (repeated, type(mirrored)(**{**vars(mirrored), "texture": repeated.texture}))
@@ -67,6 +74,13 @@ def test_textures_of_one_picture_and_two_wrap_modes_keep_both() -> None:
     assert [len(GlbReader(content).tree[name]) for name in ("images", "samplers", "textures")] == [1, 1, 2]
     found = read_foreign_glb(content, 100).model.parts
     assert [part.wrap[0] for part in found] == [Wrap.REPEAT, Wrap.MIRROR, Wrap.REPEAT]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_texture_coordinates_that_are_no_numbers_give_colors_of_the_texture(value: float) -> None:
+    content = square(0.25).to_bytes().replace(np.float32(1.25).tobytes(), np.float32(value).tobytes())
+    found = color(read_foreign_glb(content, 100).model)
+    assert np.isfinite(found).all() and found.max() <= 1
 
 
 BLACK = {"baseColorFactor": [0, 0, 0, 1]}

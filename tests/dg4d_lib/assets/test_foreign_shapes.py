@@ -10,6 +10,7 @@ import pytest
 from foreign_models import RED_AND_BLUE, png
 from PIL import Image
 
+from dg4d_lib.assets.formats import ply_elements
 from dg4d_lib.assets.formats.model_pictures import decode_picture
 from dg4d_lib.assets.formats.obj import read_obj
 from dg4d_lib.assets.formats.ply_mesh import read_ply_mesh
@@ -178,6 +179,25 @@ def test_what_a_ply_lacks_is_named(declared: str, sentence: str) -> None:
         part_of(ply("", SQUARE, ["3 0 1 2"]).replace(declared.encode(), other))
 
 
+def test_a_ply_may_declare_an_element_once() -> None:
+    content = ply("", SQUARE, ["3 0 1 2"]).replace(b"element face", b"element vertex 1\nproperty float x\nelement face")
+    with pytest.raises(BadInput, match="declares the element 'vertex' twice"):
+        part_of(content)
+
+
+def test_elements_after_the_faces_are_not_read() -> None:
+    content = ply("", SQUARE, ["3 0 1 2"]).replace(b"end_header", b"element strand 9\nproperty float x\nend_header")
+    assert len(part_of(content).faces) == 1
+
+
+def test_rows_that_are_read_one_by_one_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    uneven, even = (ply("", SQUARE, [*["3 0 1 2"] * 3, last]) for last in ("4 0 1 2 3", "3 0 1 2"))
+    monkeypatch.setattr(ply_elements, "MOST_UNEVEN", 3)
+    assert len(part_of(even).faces) == 4
+    with pytest.raises(BadInput, match="'face' has 4 rows of different lengths; at most 3 are read"):
+        part_of(uneven)
+
+
 def test_triangles_of_polygons_count_towards_the_limit() -> None:
     with pytest.raises(BadInput, match=r"2 triangles; asset\.max_faces allows 1.*max_faces=2"):
         read_ply_mesh(ply("", SQUARE, ["4 0 1 2 3"]), FILES.get, decode_picture, 1)
@@ -191,10 +211,23 @@ def test_materials_after_a_byte_order_mark_are_read() -> None:
     assert colors(model.parts[0]) == [[1, 0, 0]] and model.notes == ()
 
 
+def test_a_note_names_few_of_many_missing_material_files() -> None:
+    (note,) = obj("".join(f"mtllib {i}.mtl\n" * 2 for i in range(8)) + f"{TRIANGLE}usemtl A\nf 1 2 3\n").notes
+    assert note.endswith("'0.mtl', '1.mtl', '2.mtl', '3.mtl', '4.mtl' and 3 more")
+
+
+def test_colors_of_vertices_need_no_materials() -> None:
+    model = obj("v 0 0 0 0 1 0\nv 1 0 0 0 1 0\nv 0 1 0 0 1 0\nusemtl A\nf 1 2 3\n")
+    assert colors(model.parts[0]) == [[0, 1, 0]] and model.notes == ()
+
+
 @pytest.mark.parametrize(
     ("statement", "note"),
     [
-        ("mtllib gone.mtl\n", "no color was found for the materials 'A', 'B'; MTL files that are missing.*: gone.mtl"),
+        (
+            "mtllib gone.mtl\n",
+            "no color was found for the materials 'A', 'B'; MTL files that are missing.*: 'gone.mtl'$",
+        ),
         ("", "no color was found for the materials 'A', 'B'$"),
     ],
 )

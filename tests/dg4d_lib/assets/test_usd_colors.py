@@ -180,6 +180,25 @@ def test_a_material_that_shows_the_colors_of_the_mesh_needs_no_note(painted: Pai
     assert quarters(model) == [GREEN] * 4 and model.notes == ()
 
 
+@pytest.mark.parametrize(
+    ("shader", "name", "kind", "value"),
+    [
+        ("UsdPreviewSurface", "opacity", TYPES.Token, "x"),
+        ("UsdTransform2d", "scale", TYPES.Float, 2.0),
+        ("UsdTransform2d", "rotation", TYPES.Float, float("inf")),
+        ("UsdUVTexture", "scale", TYPES.Float, 2.0),
+    ],
+)
+def test_values_of_another_type_get_a_sentence(
+    shader: str, name: str, kind: Sdf.ValueTypeName, value: Any, painted: Painted
+) -> None:
+    painted.coordinates("st", SQUARE)
+    painted.transform()
+    painted.shader(shader).CreateInput(name, kind).Set(value)
+    with pytest.raises(BadInput, match="the mesh 'square' of the USD file or its material cannot be read"):
+        painted.read()
+
+
 def test_concave_faces_keep_their_notches(painted: Painted) -> None:
     painted.mesh.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0.2, 0.2, 0), (0, 1, 0)])
     painted.mesh.GetFaceVertexIndicesAttr().Set([3, 0, 1, 2])  # a fan from the first corner would fill the notch

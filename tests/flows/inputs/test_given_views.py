@@ -130,6 +130,7 @@ def test_a_picture_may_be_smaller_than_its_camera_says_but_not_of_another_shape(
         ({}, "no focal length"),
         ({"fl_x": 4, "w": 8, "h": 8, "k1": 0.3}, "distorted"),
         ({"fl_x": -1}, "transforms.json"),
+        ({"camera_angle_x": 0.9, "w": 10**400, "h": 8}, "transforms.json"),
         ({"frames": [{"file_path": "a.png", "transform_matrix": MATRIX, "k1": 0.3}] * 2}, "distorted"),
     ],
 )

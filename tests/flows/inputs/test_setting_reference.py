@@ -57,6 +57,18 @@ def test_the_kinds_that_have_a_setting_are_named() -> None:
         revise(profile("preview"), {"static.start.kind.name": 1})
 
 
+@pytest.mark.parametrize("section", [5, None, [1], {}])
+def test_a_section_that_was_replaced_by_a_value_has_no_kinds(section: object) -> None:
+    with pytest.raises(BadInput, match=r"unknown setting 'driving\.height'"):
+        revise(profile("preview"), {"driving": section, "driving.height": 512})
+
+
+@pytest.mark.parametrize("text", ["\x1b]0;title\x07", "1" * 10_000, "]' ; rm '", "x"])
+def test_the_advice_to_write_a_list_repeats_numbers_only(text: str) -> None:
+    with pytest.raises(BadInput, match=r"write for example `--set 'subject\.box=\[\.\.\.\]'`$"):
+        revise(profile("preview"), {"subject.box": text})
+
+
 @pytest.mark.parametrize("name", PROFILES)
 def test_every_value_of_a_profile_is_in_the_reference(name: str) -> None:
     chosen = profile(name)

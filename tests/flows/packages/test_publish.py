@@ -71,7 +71,8 @@ def test_a_file_of_the_user_is_kept_when_a_later_package_brings_one_of_its_name(
         (out / name).write_text(f"{name} of hours of work")
     (out / "same.glb").write_text("equal")
     (out / "sheet.png").mkdir()
-    (out / "sheet.png" / "own.txt").write_text("a folder")
+    for name in ("own.txt", "other.txt"):
+        (out / "sheet.png" / name).write_text("a folder")
     if in_place:
         monkeypatch.chdir(out)
     new = {"asset_rigged": "new", "same": "equal", "meshes__000": "mesh"}
@@ -81,11 +82,12 @@ def test_a_file_of_the_user_is_kept_when_a_later_package_brings_one_of_its_name(
     assert set(tree(out)) == {
         "asset_rigged.glb", "same.glb", "meshes/000.glb", "sheet.png", "provenance.json", "report.html",
         "asset_rigged.mine.glb", "asset_rigged.mine-2.glb", "meshes.mine", "sheet.mine.png/own.txt",
+        "sheet.mine.png/other.txt",
     }  # fmt: skip
     assert tree(out)["asset_rigged.glb"] == "new"
     kept = {tree(out)["asset_rigged.mine.glb"], tree(out)["asset_rigged.mine-2.glb"]}
     assert kept == {"asset_rigged.glb of hours of work", "asset_rigged.mine.glb of hours of work"}
-    assert len(said) == 3 and all("your own file" in text for text in said)
+    assert len(said) == (3 if in_place else 4) and all("your own file" in text for text in said)
     assert is_current(out, "o1")
 
 

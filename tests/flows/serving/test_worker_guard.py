@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,11 +36,15 @@ signal.pause()
 
 
 @pytest.fixture
-def guard(tmp_path: Path) -> "subprocess.Popen[bytes]":
+def guard(tmp_path: Path) -> "Iterator[subprocess.Popen[bytes]]":
     (tmp_path / "worker.py").write_text(WORKER)
     process = subprocess.Popen([sys.executable, "-c", GUARD, str(tmp_path / "worker.py"), str(tmp_path)])
-    wait_until(lambda: (tmp_path / "run").exists() and (tmp_path / "run").read_text())
-    return process
+    try:
+        wait_until(lambda: (tmp_path / "run").exists() and (tmp_path / "run").read_text())
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_a_worker_that_is_stopped_has_time_to_end_and_leaves_no_run(

@@ -7,7 +7,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.atlas import merge_parts
-from dg4d_lib.mesh.models.model import Model, ModelPart, Wrap, to_srgb
+from dg4d_lib.mesh.models.model import Model, ModelPart, Wrap, sample_bilinear, to_srgb
 from dg4d_lib.mesh.render import render_mesh
 
 SQUARE = np.array([(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
@@ -135,6 +135,19 @@ def test_more_repetitions_than_a_tile_has_become_the_mean_color(masked: bool):
     level = 1.0 if masked else float(to_srgb(np.array(0.5)))
     texels = (mesh.uvs * torch.tensor(mesh.texture.shape[1::-1])).long()
     np.testing.assert_allclose(mesh.texture[texels[:, 1], texels[:, 0]], [(level, 0, level)] * 6, atol=1 / 255)
+
+
+@pytest.mark.parametrize("wrap", list(Wrap))
+def test_repetitions_keep_the_size_of_their_texture(wrap: Wrap):
+    noise = np.random.default_rng(5).integers(0, 256, (16, 16, 4), np.uint8)
+    uvs = np.array([(0, 2), (2, 2), (2, 0), (0, 0)], float)
+    part = ModelPart("a", SQUARE, FACES, uvs, noise, wrap=(wrap, wrap))
+    mesh, _ = merge_parts(Model((part,)), 256)
+    places = np.random.default_rng(6).dirichlet((1, 1, 1), 20)
+    chosen = np.zeros(20, np.int64)
+    shown = np.einsum("nk,kc->nc", places, mesh.uvs[mesh.faces[0]].numpy().astype(float))
+    found = sample_bilinear((255 * mesh.texture.numpy()).round().astype(np.uint8), shown) / 255
+    np.testing.assert_allclose(found, part.sample(chosen, places)[0], atol=0.01)
 
 
 def test_four_repetitions_stay_sharp():

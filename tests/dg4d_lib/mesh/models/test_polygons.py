@@ -49,6 +49,14 @@ def test_stars_and_holes_are_filled_without_overlap() -> None:
         assert np.abs(areas(points, triangles, TURN[:, 2])).sum() == pytest.approx(area)
 
 
+@pytest.mark.parametrize("start", range(5))
+def test_a_corner_may_be_there_twice(start: int) -> None:
+    arrow = np.array([(0, 1), (-1, -1), (0, 0), (0, 0), (1, -1)], float)
+    points = in_space(np.roll(arrow, -start, 0))
+    found = areas(points, triangulate(points, np.arange(5), np.array([5])), TURN[:, 2])
+    assert np.abs(found).sum() == pytest.approx(1)
+
+
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
 def test_polygons_without_a_plane_have_as_many_triangles(value: float) -> None:
     assert triangulate(np.full((5, 3), value), np.arange(5), np.array([5])).shape == (3, 3)
