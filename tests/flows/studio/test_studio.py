@@ -373,7 +373,7 @@ def test_two_hundred_assets_are_painted_within_a_second(studio: Client) -> None:
 def test_a_restart_of_the_server_loses_nothing(studio: Client) -> None:
     draft = studio.draft(("lynx.png", picture("a lynx fit_motion=sleep:8").encode()))
     run = studio.post(f"/drafts/{draft}/runs", {})[1]["id"]
-    wait_until(lambda: json.loads(studio.read(f"/runs/{run}/status")[1])["state"] == "running")
+    wait_until(lambda: json.loads(studio.read(f"/runs/{run}/status")[1])["steps"][0]["state"] == "done")
     studio.server.stop()
     studio.server.start()
     address = studio.server.wait()
