@@ -103,7 +103,8 @@ def fit(subject: Subject, settings: PipelineSettings, sides: Bank | None = None)
     if sides and tracks_surface(settings.motion, kind, sides, len(video)):
         track = SurfaceTracker(rest, video, sides, rasterize, generator, settings.motion.trackings)
     prior = make_prior(kind, list(cutouts), settings.motion, None, Path(), hint, sides, track).prior
-    deformation = new_deformation(settings.deformation, rest, len(video), generator)
+    field = new_deformation(settings.deformation, rest, len(video), generator)
+    deformation = track.hinged.carrying(field, rest) if track and track.hinged else field
     others = still_views(sides, len(video))
     fitted = fit_motion(rest, deformation, video, prior, rasterize, settings.motion, generator, known=others)
     with torch.no_grad():

@@ -41,7 +41,8 @@ def run(job: Job) -> StepReport:
         track = SurfaceTracker(gaussians, video, tracked, rasterize, generator, settings.trackings, curves.add)
     with picture_of_divergence(job, rasterize):
         chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, track)
-    deformation = new_deformation(kind, gaussians, len(video), generator)
+    field = new_deformation(kind, gaussians, len(video), generator)
+    deformation = track.hinged.carrying(field, gaussians) if track and track.hinged else field
     device = preferred_device(backend)
     deformation.to(device)
     start = gaussians.to(device)

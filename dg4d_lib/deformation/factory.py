@@ -9,9 +9,11 @@ from torch import Tensor
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.deformation.on_parts import AnyField, OnParts
 from dg4d_lib.settings import DeformationSettings, FramewiseSettings, HexPlaneSettings, MlpSettings
 
-AnyDeformation = HexPlane | Mlp | Framewise
+AnyDeformation = HexPlane | Mlp | Framewise | OnParts
+FIELD = "field."  # before the names of the tensors of a field on parts
 
 
 def new_deformation(
@@ -20,7 +22,7 @@ def new_deformation(
     frames: int,
     count: int,
     generator: torch.Generator | None = None,
-) -> AnyDeformation:
+) -> AnyField:
     """Create a deformation; the identity, unless its settings start it elsewhere.
 
     Args:
@@ -53,10 +55,15 @@ def from_state_dict(
 
     Raises:
         RuntimeError: a tensor is missing, unexpected or of another shape.
+        TypeError: likewise, of the parts.
     """
     deformation = new_deformation(settings, torch.zeros(2, 3), frames, count)  # the tensors hold the real bounds
-    deformation.load_state_dict(dict(tensors))
-    return deformation.requires_grad_(False)
+    own = {name.removeprefix(FIELD): value for name, value in tensors.items() if name.startswith(FIELD)}
+    deformation.load_state_dict(own or dict(tensors))
+    deformation.requires_grad_(False)
+    if not own:
+        return deformation
+    return OnParts(deformation, **{name: value for name, value in tensors.items() if not name.startswith(FIELD)})
 
 
 def last_time(settings: DeformationSettings, frames: int) -> float:

@@ -1,7 +1,7 @@
 """Motion of a surface of two rigid parts, one of which opens about a hinge on the other."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
+from dg4d_lib.deformation.on_parts import AnyField, OnParts
 from dg4d_lib.fitting.asset_fit import AssetFit
 from dg4d_lib.fitting.asset_motion import Report, report_after, thinned_graph
 from dg4d_lib.fitting.hinge import Cut, HingeSearch
 from dg4d_lib.fitting.rigid_fit import ITERATIONS, fit_rigid_motion
-from dg4d_lib.fitting.rigid_parts import of_one_part, two_rigid_parts
+from dg4d_lib.fitting.rigid_parts import RigidMotion, of_one_part, two_rigid_parts
 from dg4d_lib.fitting.surface_tracking import bind_vertices
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.mirror import mirror_normal
@@ -28,6 +29,26 @@ TORN, MOST = 0.4, 0.98  # logarithm of the change of lengths at a lid that opens
 HINGE_ITERATIONS = 2 * ITERATIONS  # that are reported at most
 
 
+@dataclass(frozen=True)
+class Hinged:
+    """Motion of a surface of two parts.
+
+    Attributes:
+        surfaces: one per frame.
+        motion: of both parts.
+        cut: between them.
+    """
+
+    surfaces: list[InflatedSurface]
+    motion: RigidMotion
+    cut: Cut
+
+    def carrying(self, field: AnyField, gaussians: Gaussians) -> OnParts:
+        """Return the deformation of Gaussians at rest that move with their parts and by a field."""
+        motion, owners = self.motion, self.cut.above(gaussians.means).long()
+        return OnParts(field, owners, gaussians.quats, motion.centers, motion.quats, motion.places)
+
+
 def track_hinge(
     free: Sequence[InflatedSurface],
     gaussians: Gaussians,
@@ -35,7 +56,7 @@ def track_hinge(
     rasterize: Rasterizer,
     settings: AssetSettings,
     report: Report = lambda iteration, values: None,
-) -> list[InflatedSurface] | None:
+) -> Hinged | None:
     """Return the motion of a surface as that of a part and another one on a hinge, if it shows the video so.
 
     Args:
@@ -47,7 +68,7 @@ def track_hinge(
         report: called after every step with (steps done, named losses).
 
     Returns:
-        Surfaces, one per frame. None if the free motion does not tear between two parts (a waist bends, a lid opens),
+        None if the free motion does not tear between two parts (a waist bends, a lid opens),
         two rigid parts do not show the video, or none of the hinges stands out.
     """
     surface = free[0]
@@ -81,12 +102,13 @@ def track_hinge(
     ends = graph.nodes[graph.edges]
     held = (parts[graph.edges[:, 0]] != parts[graph.edges[:, 1]]) & (hinge.distances(ends.mean(1)) < NEAR)
     edges, told = torch.nonzero(held)[:, 0], lambda done, values: report_after(report, ITERATIONS, done, values)
-    opened = fit_rigid_motion(fit, start, told, edges).of_nodes(fit.graph)
+    rigid = fit_rigid_motion(fit, start, told, edges)
+    opened = rigid.of_nodes(fit.graph)
     if fit.difference(opened) > allowed:
         return None
     owners = found.cut.above(surface.vertices).long()
     moved = opened.points(surface.vertices, of_one_part(bound, parts, owners))
-    return [surface, *(replace(surface, vertices=one) for one in moved[1:])]
+    return Hinged([surface, *(replace(surface, vertices=one) for one in moved[1:])], rigid, found.cut)
 
 
 def _tears(nodes: Float[Tensor, "t m 3"], edges: Int[Tensor, "e 2"], above: Bool[Tensor, " m"]) -> bool:

@@ -23,6 +23,7 @@ KNUD_THOMSEN = 1.6075  # exponent in the approximate surface area of ellipsoids
 HIGHEST_OPACITY = 0.995
 PAIRS = 0.4  # in a round, for each Gaussian, at most; the last ones would be of different colors
 LARGEST_SCALE, LARGEST_LOGIT = 40.0, 20.0  # logarithm of the model's units, and logit: files hold any number
+THINNEST = 1e-12  # variance of a pair across a disc, of the sum of its variances, at least
 JITTER = 1e-10  # of the largest coordinate, or of 1: many Gaussians at one place would all have the same neighbors
 
 
@@ -135,5 +136,7 @@ def _shared_mass(first: Gaussians, second: Gaussians) -> Float[Tensor, " p"]:
     """Return the part of the masses of pairs that covers the same place: all that both cover if they coincide."""
     offsets = (second.means - first.means)[..., None]
     both = first.covariances + second.covariances
+    smallest = THINNEST * both.diagonal(dim1=-2, dim2=-1).sum(-1)  # else rounding makes thin discs singular
+    both.diagonal(dim1=-2, dim2=-1).add_(smallest[:, None])
     overlap = (-0.5 * offsets.mT @ torch.linalg.solve(both, offsets)).exp()[:, 0, 0]
     return overlap * first.opacities * second.opacities * torch.minimum(*map(_areas, (first.scales, second.scales)))

@@ -12,6 +12,7 @@ from safetensors.torch import save
 from dg4d_lib.deformation import factory
 from dg4d_lib.deformation.factory import AnyDeformation, deformation_tensors, from_state_dict
 from dg4d_lib.deformation.interface import Displacement
+from dg4d_lib.deformation.on_parts import AnyField
 from dg4d_lib.errors import BadInput
 from dg4d_lib.fitting.motion import bounds_of
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -36,7 +37,7 @@ class FittedMotion(NamedTuple):
 
 def new_deformation(
     settings: DeformationSettings, gaussians: Gaussians, frames: int, generator: torch.Generator | None
-) -> AnyDeformation:
+) -> AnyField:
     """Make a deformation for these Gaussians that starts as the identity."""
     return factory.new_deformation(settings, bounds_of(gaussians), frames, len(gaussians), generator)
 

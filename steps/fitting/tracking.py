@@ -10,7 +10,7 @@ import torch
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import Report
-from dg4d_lib.fitting.hinge_tracking import HINGE_ITERATIONS, track_hinge
+from dg4d_lib.fitting.hinge_tracking import HINGE_ITERATIONS, Hinged, track_hinge
 from dg4d_lib.fitting.surface_tracking import (
     DESCENT,
     LOST,
@@ -101,6 +101,7 @@ class SurfaceTracker:
         self._most, self._report = most_iterations(known, video, trackings), report
         self._numbers, self._done = count(), [0] * (3 + len(OTHERS))  # iterations of every tracking
         self._here = threading.get_ident()  # callbacks of a job belong to its thread
+        self.hinged: Hinged | None = None  # what a call found
 
     def __call__(self, surface: InflatedSurface) -> Tracked:
         """Return the surface at all frames, in one way or in each of several ways.
@@ -113,8 +114,9 @@ class SurfaceTracker:
             share = CARRIED_BESIDE_SEVERAL if self._several else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
-            if overlap >= LOST and (hinged := self._on_a_hinge(moved)):
-                return Tracked([hinged], CARRIED_SHARE)
+            self.hinged = self._on_a_hinge(moved) if overlap >= LOST else None
+            if self.hinged:
+                return Tracked([MovedSurfaces(self.hinged.surfaces)], CARRIED_SHARE)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
                 if not swinging_is_better(overlap, self._overlap(second)):
@@ -140,10 +142,9 @@ class SurfaceTracker:
             )
         )
 
-    def _on_a_hinge(self, free: MovedSurfaces) -> MovedSurfaces | None:
+    def _on_a_hinge(self, free: MovedSurfaces) -> Hinged | None:
         surfaces = [free.surface(frame) for frame in range(len(self._video))]
-        found = track_hinge(surfaces, self._gaussians, self._video, self._rasterize, SOFT, self._next_report())
-        return MovedSurfaces(found) if found else None
+        return track_hinge(surfaces, self._gaussians, self._video, self._rasterize, SOFT, self._next_report())
 
     def _next_report(self) -> Report:
         """Return what one more fit reports its iterations to."""

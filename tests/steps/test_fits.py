@@ -4,15 +4,21 @@ import json
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny_weights
 import torch
 
 from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.deformation.on_parts import OnParts
 from dg4d_lib.errors import BadInput, FitDiverged
+from dg4d_lib.fitting.hinge import Cut
+from dg4d_lib.fitting.hinge_tracking import HINGE_ITERATIONS, Hinged
+from dg4d_lib.fitting.rigid_parts import RigidMotion
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.guidance.interface import GuidanceView
+from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.known import known_view
 from steps import fit_gaussians, fit_motion
@@ -161,8 +167,17 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
     frames = torch.stack([disc(), disc(2), disc(4)])
     write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
     inputs = {"driving_video": tmp_path / "video.zip", "known_views": tmp_path / "known.zip"}
-    for name, count in (("tracked", 3), ("alone", 0)):
+
+    def on_a_hinge(free: list[InflatedSurface], *_: object) -> Hinged:
+        turns = torch.tensor([1.0, 0, 0, 0]).expand(3, 2, -1)
+        parts = RigidMotion(torch.tensor([0, 1]), torch.zeros(2, 3), turns, torch.zeros(3, 2, 3))
+        return Hinged(free, parts, Cut(np.array([0.0, 1.0, 0.0]), 0.0))
+
+    for name, count in (("tracked", 3), ("hinged", 3), ("alone", 0)):
         (tmp_path / name).mkdir()
+        if name == "hinged":  # two iterations hardly keep the outline
+            monkeypatch.setattr(tracking, "LOST", 0.0)
+            monkeypatch.setattr(tracking, "track_hinge", on_a_hinge)
         given = inputs if count else {"driving_video": inputs["driving_video"]}
         work = job(
             tmp_path / name,
@@ -171,7 +186,8 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
             ["motion", "gaussians", "curves", "picture"],
         )
         assert (TRACKED_NOTE in fit_motion.run(work).notes) == bool(count)
-        tracked = settings.motion.trackings * (2 * count + 1) if count else 0
+        tracked = settings.motion.trackings * (2 * count + 1) + HINGE_ITERATIONS if count else 0
+        assert isinstance(read_motion(work.outputs["motion"]).deformation, OnParts) == (name == "hinged")
         assert json.loads(work.outputs["curves"].read_text())["x"][-1] == settings.motion.iterations + tracked
 
 

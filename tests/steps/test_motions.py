@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from dg4d_lib.deformation.on_parts import OnParts
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import FramewiseSettings, HexPlaneSettings, MlpSettings
@@ -29,6 +30,21 @@ def test_a_motion_survives_the_round_trip(settings, tmp_path: Path):
     assert all(torch.equal(vars(before)[name], vars(after)[name]) for name in vars(before))
     write_motion(tmp_path / "n", deformation, settings, 5, 30)
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s.kind)
+def test_parts_survive_the_round_trip(settings, tmp_path: Path):
+    cloud = blob(30, 0.5, seed())
+    field = new_deformation(settings, cloud, 5, seed(1))
+    quats, places = torch.randn(5, 2, 4, generator=seed(2)), torch.randn(5, 2, 3, generator=seed(3))
+    owners = (cloud.means[:, 1] > 0).long()
+    deformation = OnParts(field, owners, cloud.quats, torch.zeros(2, 3), quats, places)
+    write_motion(tmp_path / "m", deformation, settings, 5, 30)
+    again, _, _ = read_motion(tmp_path / "m")
+    times = torch.linspace(0, 1, 7)
+    before, after = deformation.displace(cloud.means, times), again.displace(cloud.means, times)
+    assert all(torch.equal(vars(before)[name], vars(after)[name]) for name in vars(before))
+    assert not any(parameter.requires_grad for parameter in again.parameters())
 
 
 @pytest.mark.parametrize("settings", SETTINGS[:2], ids=lambda s: s.kind)

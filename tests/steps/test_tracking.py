@@ -1,6 +1,7 @@
 from dataclasses import replace
 from itertools import accumulate
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -8,6 +9,9 @@ import trimesh
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.asset_motion import Report, iterations
+from dg4d_lib.fitting.hinge import Cut
+from dg4d_lib.fitting.hinge_tracking import Hinged
+from dg4d_lib.fitting.rigid_parts import RigidMotion
 from dg4d_lib.fitting.surface_tracking import track_surface, tracking_iterations
 from dg4d_lib.fitting.tracking_order import is_loop, tracking_orders
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -116,17 +120,22 @@ def test_a_hinge_that_is_found_replaces_all_other_trackings(
         moved = replace(surface, vertices=surface.vertices + torch.tensor([shift, 0, 0]))
         return [surface, *[moved] * (FRAMES - 1)]
 
-    def hinge(free: list[InflatedSurface], *others: object) -> list[InflatedSurface]:
+    parts = RigidMotion(torch.tensor([0, 1]), torch.zeros(2, 3), torch.ones(FRAMES, 2, 4), torch.zeros(FRAMES, 2, 3))
+    cut = Cut(np.array([0.0, 1.0, 0.0]), 0.1)
+
+    def hinge(free: list[InflatedSurface], *others: object) -> Hinged:
         done.append("hinge")
         report = others[-1]
         assert callable(report)
         report(3, {"rigid parts": 1.0})
-        return [free[0], *[ball(0.01)] * (FRAMES - 1)]
+        return Hinged([free[0], *[ball(0.01)] * (FRAMES - 1)], parts, cut)
 
     monkeypatch.setattr(tracking, "track_surface", follow)
     monkeypatch.setattr(tracking, "track_hinge", hinge)
     video = video_of([0.0] * FRAMES)
-    tracked = tracker(video, views(azimuths_deg), 1, lambda iteration, values: told.append(iteration))(ball(0.0))
+    follower = tracker(video, views(azimuths_deg), 1, lambda iteration, values: told.append(iteration))
+    tracked = follower(ball(0.0))
+    assert (follower.hinged is not None) == asked
     assert ("hinge" in done) == asked
     assert told == ([3] if asked else [])
     if asked:

@@ -37,6 +37,11 @@ TENSORS = {
     "deformation.trunk": "linear, of the products of the six samples of all levels; then relu: h",
     "deformation.first, deformation.second": "linear, relu after each; in: place, time in [-1, 1]; sines, cosines",
     "deformation.heads.NAME": "what is added to gaussians.NAME: outer(h + inner(h)), both linear",
+    "deformation.field.NAME": "with parts: the tensors above and below, of what is added to the motion of the parts",
+    "deformation.owners": "n; rigid part of every Gaussian",
+    "deformation.rest": "n 4; rotations of the Gaussians that the parts turn, wxyz",
+    "deformation.centers": "k 3; of the parts at rest",
+    "deformation.quats, deformation.places": "t k 4, t k 3; rotations and centers of the parts at every frame",
     "deformation.table": "t n 10; what is added at every frame: 3 to means, 3 to log_scales, 4 to quats",
 }
 
