@@ -5,6 +5,7 @@ from typing import Literal
 
 import torch
 
+from dg4d_lib.deformation.on_parts import OnParts
 from dg4d_lib.fitting.guided_mesh import rank_guided_references
 from dg4d_lib.mesh.extraction.density import density_field
 from dg4d_lib.mesh.extraction.extract import select_level
@@ -15,7 +16,7 @@ from dg4d_lib.settings import MeshSettings
 from dg4d_lib.shape_prior import packaged
 from steps.artifacts.media import read_frames
 from steps.artifacts.mesh_plan import MeshPlan, write_plan
-from steps.artifacts.motions import read_states
+from steps.artifacts.motions import read_motion, read_states
 from steps.fitting.guesses import guessed_shapes
 from steps.runtime.job import Job, StepReport
 
@@ -36,6 +37,9 @@ def run(job: Job) -> StepReport:
     rasterize = get_rasterizer(job.settings.rasterizer)
     states, displacement = read_states(job.inputs["gaussians"], job.inputs["motion"])
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
+    if mode == "auto" and isinstance(read_motion(job.inputs["motion"]).deformation, OnParts):
+        mode = "per_frame"
+        notes.append("a part opens about a hinge and shows what the first frame hides: every frame gets its own mesh")
     others: tuple[int, ...] = ()
     guide: Literal["gaussians", "video"] = "gaussians"
     weights: dict[str, str] = {}

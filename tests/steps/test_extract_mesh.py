@@ -12,6 +12,7 @@ from torch import Tensor
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.on_parts import OnParts
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.fitting import guided_mesh
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -344,6 +345,19 @@ def test_what_no_trial_follows_gets_a_mesh_per_frame(
     assert (plan.mode, plan.guide, plan.reference_frame) == ("per_frame", "gaussians", 0)
     limit = "84.0% IoU on trial, mesh.min_guided" if with_video else "80.0% IoU on trial, mesh.min_followed"
     assert any(limit in note for note in facts.notes)
+
+
+@pytest.mark.parametrize("mode", ["auto", "tracked"])
+def test_parts_on_a_hinge_get_a_mesh_per_frame_unless_one_is_asked_for(mode: str, tmp_path: Path) -> None:
+    job, _ = make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": mode}))
+    assert read_plan(tmp_path / "plan").mode == "tracked"
+    cloud, turns = ball(), torch.tensor([1.0, 0, 0, 0]).expand(FRAMES, 2, -1)
+    owners, field = (cloud.means[:, 1] > 0).long(), Framewise(FRAMES, len(cloud))
+    moved = OnParts(field, owners, cloud.quats, torch.zeros(2, 3), turns, torch.zeros(FRAMES, 2, 3))
+    write_motion(tmp_path / "motion", moved, FramewiseSettings(), FRAMES, len(cloud))
+    notes = plan_mesh.run(job).notes
+    assert read_plan(tmp_path / "plan").mode == ("per_frame" if mode == "auto" else "tracked")
+    assert any("opens about a hinge" in note for note in notes) == (mode == "auto")
 
 
 @pytest.mark.parametrize(("thickness", "finer"), [(0.0, True), (0.4, False)])
