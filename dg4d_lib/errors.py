@@ -6,6 +6,8 @@ DG4DError
 └── FitDiverged           non-finite loss, or a model without Gaussians
 """
 
+from collections.abc import Sequence
+
 MAX_QUOTED = 80  # characters of a value in a message
 
 
@@ -29,3 +31,9 @@ def quoted(value: object) -> str:
     """Return the `repr` of a value for a message, shortened to `MAX_QUOTED` characters."""
     text = repr(value)
     return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."
+
+
+def listed(items: Sequence[str], most: int) -> str:
+    """Return the first items of a list for a message, and how many more there are."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return ", ".join(items[:most]) + more

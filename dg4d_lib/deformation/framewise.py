@@ -9,6 +9,15 @@ from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.errors import BadInput
 
 
+def interpolated(table: Float[Tensor, "t n c"], times: Float[Tensor, " k"]) -> Float[Tensor, "k n c"]:
+    """Return the rows of a table over frames at times in [0, 1], linearly between frames."""
+    last = table.shape[0] - 1
+    position = times.clamp(0, 1) * last
+    left = position.floor().clamp(0, max(last - 1, 0)).long()
+    weight = (position - left)[:, None, None]
+    return table[left] * (1 - weight) + table[(left + 1).clamp(max=last)] * weight
+
+
 class Framewise(nn.Module):
     """Table of displacements, interpolated linearly between frames.
 
@@ -37,11 +46,7 @@ class Framewise(nn.Module):
         """
         if len(means) != self.table.shape[1]:
             raise BadInput(f"this frame-wise deformation has {self.table.shape[1]} Gaussians; given {len(means)}")
-        last = self.table.shape[0] - 1
-        position = times.clamp(0, 1) * last
-        left = position.floor().clamp(0, max(last - 1, 0)).long()
-        weight = (position - left)[:, None, None]
-        rows = self.table[left] * (1 - weight) + self.table[(left + 1).clamp(max=last)] * weight
+        rows = interpolated(self.table, times)
         return Displacement(rows[..., :3], rows[..., 3:6], rows[..., 6:])
 
     def grid_parameters(self) -> list[nn.Parameter]:

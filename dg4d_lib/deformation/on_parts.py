@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dg4d_lib.deformation.framewise import Framewise
+from dg4d_lib.deformation.framewise import Framewise, interpolated
 from dg4d_lib.deformation.hexplane import HexPlane
 from dg4d_lib.deformation.interface import Displacement
 from dg4d_lib.deformation.mlp import Mlp
@@ -65,12 +65,8 @@ class OnParts(nn.Module):
         """
         if len(means) != len(self.owners):
             raise BadInput(f"this deformation has {len(self.owners)} Gaussians on its parts; given {len(means)}")
-        last = len(self.places) - 1
-        position = times.clamp(0, 1) * last
-        left = position.floor().clamp(0, max(last - 1, 0)).long()
-        right, weight = (left + 1).clamp(max=last), (position - left)[:, None, None]
-        turns = functional.normalize(torch.lerp(self.quats[left], self.quats[right], weight), dim=-1)
-        places = torch.lerp(self.places[left], self.places[right], weight)
+        turns = functional.normalize(interpolated(self.quats, times), dim=-1)
+        places = interpolated(self.places, times)
         arms = means - self.centers[self.owners]
         moved = rotate(quat_to_rotmat(turns)[:, self.owners], arms) + places[:, self.owners]
         turned = quat_multiply(turns[:, self.owners], self.rest.expand(len(times), -1, -1))

@@ -119,7 +119,7 @@ class AssetFit:
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:
         """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
-        return self.difference_of(motion.points(self.cloud.means, self.graph))
+        return self.difference_of(self._means(motion))
 
     @torch.no_grad()
     def difference_of(self, means: Float[Tensor, "t n 3"]) -> float:
@@ -130,12 +130,12 @@ class AssetFit:
     @torch.no_grad()
     def outline_errors(self, motion: NodeMotion) -> Float[Tensor, " t"]:
         """Return the weighted loss of alpha at every frame."""
-        drawn = self._rendering(motion.points(self.cloud.means, self.graph)).alpha
+        drawn = self._rendering(self._means(motion)).alpha
         return pyramid_residuals(drawn, self.alphas).square().sum(1) * (self.settings.alpha_weight / self.area)
 
     def residuals(self, motion: NodeMotion, frames: list[int]) -> Float[Tensor, "t r"]:
         """Return numbers per frame whose squares sum to the losses of color, alpha and shifts across the plane."""
-        settings, rendering = self.settings, self._rendering(motion.points(self.cloud.means, self.graph))
+        settings, rendering = self.settings, self._rendering(self._means(motion))
         parts = [
             math.sqrt(settings.color_weight / self.area) * pyramid_residuals(rendering.color, self.colors[frames]),
             math.sqrt(settings.alpha_weight / self.area) * pyramid_residuals(rendering.alpha, self.alphas[frames]),
@@ -167,7 +167,7 @@ class AssetFit:
 
     def picture_losses(self, motion: NodeMotion, frames: list[int]) -> dict[str, Tensor]:
         """Return the weighted losses of color and alpha of some frames."""
-        return self._picture_losses(motion.points(self.cloud.means, self.graph), frames)
+        return self._picture_losses(self._means(motion), frames)
 
     def _picture_losses(self, means: Float[Tensor, "t n 3"], frames: list[int]) -> dict[str, Tensor]:
         rendering = self._rendering(means)
@@ -178,7 +178,10 @@ class AssetFit:
     @torch.no_grad()
     def silhouettes(self, motion: NodeMotion) -> Bool[Tensor, "t h w 1"]:
         """Return where the model is in the pictures."""
-        return self._rendering(motion.points(self.cloud.means, self.graph)).alpha > 0.5
+        return self._rendering(self._means(motion)).alpha > 0.5
+
+    def _means(self, motion: NodeMotion) -> Float[Tensor, "t n 3"]:
+        return motion.points(self.cloud.means, self.graph)
 
     def _rendering(self, means: Float[Tensor, "t n 3"]) -> Rendering:
         """Render the Gaussians at places per frame."""

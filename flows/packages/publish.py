@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, listed
 from flows.inputs.naming import check_folder_name
 from flows.inputs.package_record import RECORD, record_of
 from steps.artifacts.archives import unpack
@@ -100,8 +100,7 @@ def load_verified(folder: Path) -> dict[str, Any]:
         raise BadInput(f"{folder} cannot be used: its {RECORD} has an unknown format; make the asset again")
     faults = [f"{name} {fault}" for name, fact in record["files"].items() if (fault := _fault(folder / name, fact))]
     if faults:
-        more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
-        raise BadInput(f"{folder} is damaged: {', '.join(faults[:3])}{more}; make the asset again")
+        raise BadInput(f"{folder} is damaged: {listed(faults, 3)}; make the asset again")
     return record
 
 

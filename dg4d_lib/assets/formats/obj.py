@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dg4d_lib.assets.formats.mtl import Material, library_names, read_mtl
-from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision, to_linear
+from dg4d_lib.errors import BadInput, listed
+from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision, to_linear, too_many_triangles
 from dg4d_lib.mesh.models.polygons import triangulate
 
 Read = Callable[[str], bytes | None]  # content of a file beside the model, by its name; None if it is missing
@@ -115,10 +115,7 @@ class _Content:
         group.counts.append(len(corners))
         self.faces += len(corners) - 2
         if self.faces > self.max_faces:
-            raise BadInput(
-                f"the model has more than {self.max_faces} triangles, the limit asset.max_faces: simplify it, or raise "
-                "the limit with --set asset.max_faces=N"
-            )
+            raise too_many_triangles(self.max_faces)
 
     def model(self, decode: Decode) -> Model:
         """Return the parts."""
@@ -150,9 +147,7 @@ class _Content:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first names, and how many more there are."""
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(repr(name[:80]) for name in names[:MOST_NAMED]) + more
+    return listed([repr(name[:80]) for name in names], MOST_NAMED)
 
 
 def _corner(word: str, positions: int, uvs: int) -> tuple[int, int]:

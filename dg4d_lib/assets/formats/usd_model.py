@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pxr import Gf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol
 
 from dg4d_lib.assets.formats.usd_colors import WHITE, Decode, UsdColor, UsdMaterials
-from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision
+from dg4d_lib.errors import BadInput, listed
+from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision, too_many_triangles
 from dg4d_lib.mesh.models.polygons import triangulate
 
 MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
@@ -96,10 +96,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
         parts += found
         faces += sum(len(part.faces) for part in found)
         if faces > max_faces:
-            raise BadInput(
-                f"the model has more than {max_faces} triangles, the limit asset.max_faces: simplify it, or raise the "
-                "limit with --set asset.max_faces=N"
-            )
+            raise too_many_triangles(max_faces)
     if not parts:
         raise BadInput(_no_mesh(stage))
     return single_precision(parts, (*dict.fromkeys(materials.notes), *_left_out(others)))
@@ -109,8 +106,7 @@ def _left_out(objects: list[str]) -> list[str]:
     """Return a note about objects that are no meshes."""
     if not objects:
         return []
-    more = f" and {len(objects) - MOST_NAMED} more" if len(objects) > MOST_NAMED else ""
-    return [f"objects of the USD file that are no meshes were left out: {', '.join(objects[:MOST_NAMED])}{more}"]
+    return [f"objects of the USD file that are no meshes were left out: {listed(objects, MOST_NAMED)}"]
 
 
 def _no_mesh(stage: Usd.Stage) -> str:

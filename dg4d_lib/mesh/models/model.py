@@ -154,6 +154,14 @@ def far_center(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " 3"]:
     return low / 2 + high / 2 if is_far else np.zeros(3)
 
 
+def too_many_triangles(most: int) -> BadInput:
+    """Return the error about a model with more triangles than `asset.max_faces`, whose rest was not read."""
+    return BadInput(
+        f"the model has more than {most} triangles, the limit asset.max_faces: simplify it, or raise the limit with "
+        "--set asset.max_faces=N"
+    )
+
+
 def moved_note(center: Float[np.ndarray, " 3"]) -> str:
     """Return a note about a model that was moved from a far center to the origin."""
     place = ", ".join(f"{value:.6g}" for value in center)
