@@ -395,8 +395,11 @@ def run(options: argparse.Namespace, console: Console) -> None:
     """Run the requested ablations and print their tables.
 
     Raises:
-        BadInput: a data set, an object or a setting cannot be used.
+        BadInput: a data set, an object, a number or a setting cannot be used.
     """
+    for name in ("seeds", "frames", "size"):
+        if (value := getattr(options, name)) < 1:
+            raise BadInput(f"--{name} is {value}; give at least 1")
     if options.quick:
         options.seeds, options.frames, options.size = 1, 4, 48
     base = {

@@ -9,6 +9,12 @@ DG4DError
 from collections.abc import Sequence
 
 MAX_QUOTED = 80  # characters of a value in a message
+OUT_OF_MEMORY = (  # in messages of errors that are no torch.OutOfMemoryError
+    "can't allocate memory",  # the allocator of the CPU
+    "CUDA error: out of memory",  # the CUDA runtime, outside of torch's allocator
+    "CUBLAS_STATUS_ALLOC_FAILED",  # cuBLAS allocates its own workspace
+    "CUDNN_STATUS_ALLOC_FAILED",
+)
 
 
 class DG4DError(Exception):
@@ -37,3 +43,10 @@ def listed(items: Sequence[str], most: int) -> str:
     """Return the first items of a list for a message, and how many more there are."""
     more = f" and {len(items) - most} more" if len(items) > most else ""
     return ", ".join(items[:most]) + more
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether torch ran out of memory, on a GPU or on the CPU; torch itself is not imported for this."""
+    if not isinstance(error, RuntimeError):
+        return False
+    return type(error).__name__ == "OutOfMemoryError" or any(sign in str(error) for sign in OUT_OF_MEMORY)

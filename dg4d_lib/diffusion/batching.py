@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import torch
 
-from dg4d_lib.errors import BackendUnavailable
+from dg4d_lib.errors import BackendUnavailable, is_out_of_memory
 
 Result = TypeVar("Result")
 
@@ -86,8 +86,3 @@ class MicroBatches:
         self.size = tried // 2
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
-
-
-def is_out_of_memory(error: RuntimeError) -> bool:
-    """Return true if torch ran out of memory, on a GPU or on the CPU."""
-    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

@@ -1,7 +1,8 @@
 """Loading of pipeline components from a model folder in diffusers' layout, frozen.
 
     model/
-      vae/           config.json, diffusion_pytorch_model.safetensors (or .fp16.safetensors, .bin, .fp16.bin)
+      vae/           config.json, diffusion_pytorch_model.safetensors (or .fp16.safetensors, .bin, .fp16.bin), or
+                     shards of it with an index, diffusion_pytorch_model.safetensors.index.json (or .index.fp16.json)
       unet/          the same
       image_encoder/ config.json, model.safetensors (or .fp16.safetensors), pytorch_model.bin (or .fp16.bin)
       scheduler/     scheduler_config.json
@@ -9,6 +10,7 @@
 No code of a folder is executed: classes come from diffusers and transformers, tensors from the files.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +23,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from dg4d_lib.diffusion.flop_counter import attach_flop_counter
-from dg4d_lib.errors import BackendUnavailable, BadInput
+from dg4d_lib.errors import BackendUnavailable, BadInput, quoted
 from dg4d_lib.settings import Precision
 
 DTYPES: dict[Precision, torch.dtype] = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
@@ -111,8 +113,8 @@ def load_component(cls: Any, folder: Path, placement: Placement, names: tuple[st
     try:
         component, info = cls.from_pretrained(
             folder,
-            variant=HALF if file.stem.endswith(f".{HALF}") else None,
-            use_safetensors=file.suffix == ".safetensors",
+            variant=HALF if f".{HALF}" in file.suffixes else None,
+            use_safetensors=".safetensors" in file.suffixes,
             local_files_only=True,
             output_loading_info=True,
             dtype=placement.dtype,
@@ -142,7 +144,9 @@ def require_all_tensors(source: Path, info: Mapping[str, Any]) -> None:
 
 
 def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half: bool = False) -> Path:
-    """Return the file of tensors to read; safetensors are preferred to pickles, then the requested precision.
+    """Return the file of tensors to read, or the index of its shards.
+
+    Safetensors are preferred to pickles, then the requested precision to the other, then a file to shards.
 
     Args:
         folder: of the component.
@@ -154,19 +158,22 @@ def weights_file(folder: Path, names: tuple[str, ...] = (DIFFUSERS_FILE,), half:
     """
     variants = (f".{HALF}", "") if half else ("", f".{HALF}")
     candidates = [
-        folder / f"{name}{variant}{suffix}"
+        (f"{name}{variant}{suffix}", f"{name}{suffix}.index{variant}.json")
         for suffix in (".safetensors", ".bin")
         for variant in variants
         for name in names
     ]
-    for file in candidates:
+    for file in (folder / name for pair in candidates for name in pair):
         if file.is_file():
             return file
-    raise BadInput(f"{folder} has no tensors; expected one of: {', '.join(file.name for file in candidates)}")
+    raise BadInput(
+        f"{folder} has no tensors; expected one of: {', '.join(name for name, _ in candidates)}; or shards with an "
+        f"index such as {candidates[0][1]}"
+    )
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
-    """Read the tensors of a safetensors file, or of a pickle that holds only tensors.
+    """Read the tensors of a safetensors file, of a pickle that holds only tensors, or of the shards of an index.
 
     Raises:
         BadInput: the file cannot be read.
@@ -174,6 +181,9 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
     try:
         if file.suffix == ".safetensors":
             return load_file(file)
+        if file.suffix == ".json":
+            shards = sorted(set(dict(json.loads(file.read_text(encoding="utf-8"))["weight_map"]).values()))
+            return {key: tensor for shard in shards for key, tensor in read_tensors(_shard(file, shard)).items()}
         return dict(torch.load(file, map_location="cpu", weights_only=True))
     except UNREADABLE as error:
         raise BadInput(f"{file} cannot be read: {_first_line(error)}") from error
@@ -207,6 +217,13 @@ def frozen(component: Any, placement: Placement) -> Any:
     """Return the component in evaluation mode, without weight gradients, on its device."""
     component = component.eval().requires_grad_(False).to(placement.device)
     return component.to(memory_format=torch.channels_last) if placement.channels_last else component
+
+
+def _shard(index: Path, name: str) -> Path:
+    """Return a shard beside its index."""
+    if Path(name).name != name:
+        raise BadInput(f"{index} names a shard outside of its folder, {quoted(name)}; download the weights again")
+    return index.with_name(name)
 
 
 def _diffusers() -> Any:

@@ -38,12 +38,14 @@ class _Adapter(BaseModel):
         lora_alpha: of all layers; None: equal to their rank.
         alpha_pattern: alpha of single layers, by a pattern of the end of their names.
         use_rslora: divide alpha by the square root of the rank.
+        use_dora: the factors have magnitudes beside them (Liu et al. 2024), which are not supported.
     """
 
     model_config = ConfigDict(frozen=True)
     lora_alpha: FiniteFloat | None = None
     alpha_pattern: dict[re.Pattern[str], FiniteFloat] = {}
     use_rslora: bool = False
+    use_dora: bool = False
 
 
 def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
@@ -55,7 +57,8 @@ def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
         scale: strength.
 
     Raises:
-        BadInput: the file is no LoRA, or belongs to another network.
+        BadInput: the file is no LoRA, holds more than a LoRA's factors and alphas, or belongs to another network; or
+            a number in it is not finite.
     """
     file = lora_file(path)
     factors = _read_factors(file)
@@ -91,12 +94,23 @@ def _read_factors(file: Path) -> dict[str, _Factors]:
     tensors = read_tensors(file)
     down: dict[str, Tensor] = {}
     up: dict[str, Tensor] = {}
+    others: list[str] = []
     for key, tensor in tensors.items():
         if (found := FACTOR.match(key)) is not None:
             (down if found["factor"] in DOWN else up)[found["layer"]] = tensor
+        elif not key.endswith(".alpha"):
+            others.append(key)
     if not down or set(down) != set(up) or any(one.ndim != 2 for one in (*down.values(), *up.values())):
         raise BadInput(f"{file} is no LoRA of linear layers; give one that was made for this network")
     adapter = _read_adapter(file)
+    if others or adapter.use_dora:
+        rest = f"{min(others)} ({len(others)} such tensors)" if others else "use_dora in its metadata"
+        raise BadInput(
+            f"{file} is more than a LoRA: {rest} cannot be merged; give a LoRA of factors and alphas alone, without "
+            "DoRA, biases, LoKr or full differences"
+        )
+    if broken := sorted(key for key, tensor in tensors.items() if not tensor.isfinite().all()):
+        raise BadInput(f"{file} is damaged: {broken[0]} has values that are not finite; download or train it again")
     return {
         _layer_name(name): _Factors(down[name], up[name], _scaling(tensors, adapter, name, down[name].shape[0]))
         for name in down

@@ -14,17 +14,30 @@ from dg4d_lib.errors import BadInput
 
 NUM_TRAIN_TIMESTEPS = 1000
 BETA_START, BETA_END = 0.00085, 0.012  # scaled-linear, Stable Diffusion v1
+LOWEST_FIRST_TIMESTEP = 901  # a sampler starts from pure noise; alphabar is 0.014 there; the first of 10 steps
 
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """Noise schedule and prediction type of a model, with the field names of diffusers."""
+    """Noise schedule and prediction type of a model, with the field names of diffusers.
+
+    Attributes:
+        beta_start: first beta.
+        beta_end: last beta.
+        beta_schedule: spacing in between.
+        num_train_timesteps: number of betas.
+        prediction_type: output of the network.
+        trained_betas: the configuration lists the betas, in place of the four fields above.
+        rescale_betas_zero_snr: the betas are rescaled, so that the last timestep is pure noise (Lin et al. 2023).
+    """
 
     beta_start: float
     beta_end: float
     beta_schedule: str
     num_train_timesteps: int
     prediction_type: str
+    trained_betas: bool = False
+    rescale_betas_zero_snr: bool = False
 
 
 SCHEDULE = BetaSchedule(BETA_START, BETA_END, "scaled_linear", NUM_TRAIN_TIMESTEPS, "epsilon")
@@ -44,9 +57,17 @@ def add_noise(latents: Float[Tensor, "*b"], noise: Float[Tensor, "*b"], timestep
 
 
 def ddim_timesteps(num_inference_steps: int) -> tuple[int, ...]:
-    """Return evenly spaced timesteps in descending order: 981, 961, ..., 1 for 50 steps, to be followed by 0."""
+    """Return evenly spaced timesteps in descending order: 981, 961, ..., 1 for 50 steps, to be followed by 0.
+
+    They are those of diffusers ("leading", offset 1) where these start at 901 or above. Where the rounded stride or a
+    small number of steps would start below (667 for 334 steps, 1 for one step), the first is 901.
+
+    Args:
+        num_inference_steps: number of timesteps, 1 to 999.
+    """
     stride = NUM_TRAIN_TIMESTEPS // num_inference_steps
-    return tuple(stride * i + 1 for i in reversed(range(num_inference_steps)))
+    first = max(LOWEST_FIRST_TIMESTEP, stride * (num_inference_steps - 1) + 1)
+    return tuple(torch.linspace(first, 1, num_inference_steps, dtype=torch.float64).round().int().tolist())
 
 
 def ddim_step(
@@ -73,6 +94,8 @@ def read_schedule(model: Path) -> BetaSchedule:
             beta_schedule=str(config["beta_schedule"]),
             num_train_timesteps=int(config["num_train_timesteps"]),
             prediction_type=str(config.get("prediction_type", "epsilon")),
+            trained_betas=config.get("trained_betas") is not None,
+            rescale_betas_zero_snr=bool(config.get("rescale_betas_zero_snr", False)),
         )
     except FileNotFoundError as error:
         raise BadInput(f"{file} is missing; give weights in the layout of diffusers") from error

@@ -17,6 +17,7 @@ from dg4d_lib.metrics.ssim import ssim
 from dg4d_lib.rasterizer.interface import Rendering
 
 WHITE = (1.0, 1.0, 1.0)
+OVERFLOW_ADVICE = "the diffusion prior overflows in its precision; set prior.precision=bf16 or fp32"
 LEVELS = (1, 4, 8)  # widths of the filters over pictures that a pyramid compares, pixels; 1: none
 
 
@@ -81,7 +82,8 @@ def check_finite(
 
     Args:
         stage: name of the fit.
-        losses: scalars by name; "loss" is the minimized total.
+        losses: scalars by name; "loss" is the minimized total. If "guidance" is not finite and "reference" is, the
+            prior overflows, and the message says so in place of `advice`.
         gradients: of the parameters; None is skipped.
         iteration: for the message, "iteration 3 of 200".
         advice: remedy for the message.
@@ -93,6 +95,8 @@ def check_finite(
     norm = get_total_norm([gradient for gradient in gradients if gradient is not None], torch.inf)
     *values, largest = torch.stack([*(loss.detach() for loss in losses.values()), norm]).tolist()
     numbers = dict(zip(losses, values, strict=True))
+    if math.isfinite(numbers.get("reference", math.nan)) and not math.isfinite(numbers.get("guidance", 0.0)):
+        advice = OVERFLOW_ADVICE
     for quantity, value in (("loss", numbers["loss"]), ("gradient", largest)):
         if not math.isfinite(value):
             raise Diverged(f"{stage}: the {quantity} became {value} at {iteration}; {advice}", gaussians.detach())

@@ -14,10 +14,12 @@ from torch import Tensor
 
 from dg4d_lib.diffusion.batching import MicroBatches
 from dg4d_lib.diffusion.noise_schedule import NUM_TRAIN_TIMESTEPS, add_noise, alphas_cumprod
+from dg4d_lib.errors import BadInput, listed
 
 T_MAX_END = 0.02  # fraction of the schedule at the end of the annealing (paper)
 T_MAX_LIMIT = 0.98  # fraction of the schedule above which T_max is clipped (DreamFusion)
 MIN_TIMESTEP = 20  # of 1000 (DreamFusion: 0.02)
+MAX_LISTED = 8  # frames in a message
 
 PredictNoise = Callable[[Float[Tensor, "b c h w"], int], Float[Tensor, "b c h w"]]
 
@@ -128,6 +130,25 @@ def distill_in_pieces(
     losses, gradients, usable = zip(*batches.run(differentiate, len(images)), strict=True)
     loss = torch.where(torch.stack(usable).any(), torch.stack(losses).sum(), torch.nan)
     return _Differentiated.apply(images, loss / len(images), torch.cat(gradients) / len(images))
+
+
+def require_finite_conditioning(*parts: Float[Tensor, "t *_"]) -> None:
+    """Refuse the encoding of frames if the networks overflowed in it: the loss of such frames would be zero.
+
+    Args:
+        parts: embeddings and latents, one per frame.
+
+    Raises:
+        BadInput: names the frames.
+    """
+    finite = torch.stack([part.flatten(1).isfinite().all(1) for part in parts]).all(0)
+    if broken := [str(frame) for frame, whole in enumerate(finite.tolist()) if not whole]:
+        raise BadInput(
+            f"the encoding of {len(broken)} of {len(finite)} frames is not finite (frame "
+            f"{listed(broken, MAX_LISTED)}): the networks overflow in this precision, or their weights are damaged; "
+            "set the precision of the model (prior.precision, refiner.prior.precision or static.start.precision) to "
+            "bf16 or fp32"
+        )
 
 
 class _Differentiated(torch.autograd.Function):

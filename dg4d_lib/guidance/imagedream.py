@@ -35,7 +35,7 @@ from dg4d_lib.diffusion.components import (
 from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, at_least_float32, decode_images, encode_images
 from dg4d_lib.diffusion.noise_schedule import SCHEDULE, ddim_step, ddim_timesteps, require_schedule
 from dg4d_lib.errors import BackendUnavailable, BadInput
-from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces
+from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces, require_finite_conditioning
 from dg4d_lib.guidance.imagedream_unet import MultiViewUnet, MultiViewUnetConfig
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import ImageDreamPriorSettings, Precision
@@ -130,6 +130,7 @@ class ImageDream:
             prompt: of all of them; may be empty.
 
         Raises:
+            BadInput: the networks overflow, so that the encoding of an image is not finite.
             BackendUnavailable: a single image does not fit into memory.
         """
 
@@ -140,6 +141,7 @@ class ImageDream:
 
         batches = MicroBatches("frames for ImageDream", RING)  # a ring of renders has to fit anyway
         image_embeds, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(images)), strict=True))
+        require_finite_conditioning(image_embeds, latents)
         positive, negative = (self._encode_prompt(text).expand(len(images), -1, -1) for text in (prompt, ""))
         return ImageDreamCondition(positive, negative, image_embeds, latents)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import GuidanceView
-from dg4d_lib.images import over_white, resize_planes
+from dg4d_lib.images import over_white, resize_planes, to_bytes
 from dg4d_lib.settings import OraclePriorSettings
 
 
@@ -95,7 +95,7 @@ def _blur_and_shift(
     shifted = [shift(plane, (*by, 0), order=1) for plane, by in zip(planes, shifts.tolist(), strict=True)]
     soft = torch.from_numpy(np.stack(shifted))
     color = soft[..., :3] / soft[..., 3:].clamp(min=1e-6)
-    return (torch.cat([color, soft[..., 3:]], -1).clamp(0, 1) * 255).round().to(torch.uint8)
+    return to_bytes(torch.cat([color, soft[..., 3:]], -1))
 
 
 def _pose(camera: OrbitCamera) -> tuple[float, float, float]:

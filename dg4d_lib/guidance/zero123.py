@@ -31,7 +31,7 @@ from dg4d_lib.diffusion.latents import LATENT_CHANNELS, LATENT_SIZE, SIZE, encod
 from dg4d_lib.diffusion.noise_schedule import SCHEDULE, require_schedule
 from dg4d_lib.diffusion.single_token_attention import shorten_attention
 from dg4d_lib.errors import BadInput
-from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces
+from dg4d_lib.guidance.distillation import TimestepSchedule, distill_in_pieces, require_finite_conditioning
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.settings import Precision, Zero123PriorSettings
 
@@ -102,6 +102,9 @@ class Zero123:
             frames: of the input camera, over white, in [0, 1].
             schedule: of the timestep.
             input_camera: camera of the frames; the default is azimuth and elevation 0.
+
+        Raises:
+            BadInput: the networks overflow, so that the encoding of a frame is not finite.
         """
         precision: Precision = self.settings.precision
         batches = MicroBatches.within(
@@ -114,6 +117,7 @@ class Zero123:
             return self.image_encoder(pixels).image_embeds, encode_images(self.vae, images).to(self.unet.dtype)
 
         embeddings, latents = (torch.cat(parts) for parts in zip(*batches.run(embed, len(frames)), strict=True))
+        require_finite_conditioning(embeddings, latents)
         return ConditionedZero123(
             vae=self.vae,
             unet=self.unet,

@@ -4,12 +4,13 @@ A U-Net whose coarsest level is a small transformer. Every pixel is a ray of the
 gives the probability that a depth lies inside the subject. Probabilities near one half are its uncertainty.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
@@ -32,12 +33,23 @@ class ShapePriorConfig:
         blocks: residual blocks at each of the first three levels, on the way down and on the way up.
         layers: transformer layers.
         head: hidden width of the network that every ray goes through.
+
+    Raises:
+        BadInput: the widths do not suit the normalization or the attention heads.
     """
 
     widths: tuple[int, int, int, int] = (32, 48, 96, 192)
     blocks: tuple[int, int, int] = (1, 1, 2)
     layers: int = 4
     head: int = 96
+
+    def __post_init__(self) -> None:
+        steps = (GROUPS, GROUPS, GROUPS, _Layer.HEAD)
+        if any(width < 1 or width % step for width, step in zip(self.widths, steps, strict=True)):
+            raise BadInput(
+                f"widths {' '.join(map(str, self.widths))} do not fit the network; give three multiples of {GROUPS} "
+                f"(groups of the normalization) and one of {_Layer.HEAD} (width of an attention head)"
+            )
 
 
 @dataclass(frozen=True)
@@ -235,8 +247,24 @@ def load_network(path: Path) -> ShapePriorNetwork:
     """Read a network that `save_network` wrote, in float32, for inference.
 
     Raises:
-        BadInput: the file is of another format.
+        BadInput: the file cannot be read, is of another format, or holds numbers that are not finite.
     """
+    try:
+        network = _read_network(path)
+    except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise BadInput(f"{path} cannot be read as weights of the shape prior: {reason}") from error
+    if broken := not_finite(network.state_dict()):
+        raise BadInput(f"{path} is damaged: {broken[0]} has values that are not finite; train or download it again")
+    return network
+
+
+def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
+    """Return the names of tensors with values that are not finite."""
+    return [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
+
+
+def _read_network(path: Path) -> ShapePriorNetwork:
     with safe_open(path, "pt") as file:
         header = file.metadata() or {}
         if header.get("format") != FORMAT:

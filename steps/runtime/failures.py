@@ -3,7 +3,7 @@
 import traceback
 from pathlib import Path
 
-from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
+from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged, is_out_of_memory
 from steps.contract import FailureKind
 from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 from steps.store.files import NO_SPACE
@@ -22,8 +22,7 @@ def failure_kind(error: BaseException) -> FailureKind:
     """Return the contract's kind of failure for an exception."""
     if isinstance(error, OSError) and error.errno in NO_SPACE:
         return "bad_input"
-    no_memory = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)  # CUDA, CPU
-    if isinstance(error, RuntimeError) and no_memory:
+    if is_out_of_memory(error):
         return "out_of_memory"
     return next((kind for matched, kind in KINDS.items() if isinstance(error, matched)), "crashed")
 

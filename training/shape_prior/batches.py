@@ -5,8 +5,9 @@ import signal
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 from typing import Any
 
@@ -95,11 +96,16 @@ def join_samples(samples: list[Sample], rays: int, generator: np.random.Generato
 
 
 def batches(seed: int, first: int, count: int, size: int, rays: int, workers: int) -> Iterator[Batch]:
-    """Yield batches `first` to `first + count - 1`, made by worker processes, or here if there are none."""
+    """Yield batches `first` to `first + count - 1`, made by worker processes, or here if there are none.
+
+    Raises:
+        BrokenProcessPool: a worker was killed; the others are ended, too.
+    """
     numbers = iter(range(first, first + count))
     if not workers:
         yield from (make_batch(seed, number, size, rays) for number in numbers)
         return
+    others = set(active_children())
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
         waiting: deque[Future[dict[str, object]]] = deque()
         try:
@@ -109,14 +115,18 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
                     yield _unpacked(waiting.popleft().result())
             while waiting:
                 yield _unpacked(waiting.popleft().result())
+        except BrokenProcessPool:
+            for worker in set(active_children()) - others:
+                worker.kill()  # the executor sends SIGTERM, which workers ignore, and would wait for them
+            raise
         finally:
-            for future in waiting:
-                future.cancel()
+            pool.shutdown(cancel_futures=True)
 
 
 def _prepare_worker() -> None:
-    """Use one thread, leave interrupts to the trainer, and end when it is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Use one thread, leave signals to the trainer, and end when it is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole process group
+        signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)
     Thread(target=_end_with_parent, daemon=True).start()
 

@@ -1,12 +1,14 @@
 """Losses and validation figures of the shape prior."""
 
 from dataclasses import dataclass
+from statistics import mean
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.errors import FitDiverged
 from dg4d_lib.shape_prior.frustum import KNOTS
 from dg4d_lib.shape_prior.network import ShapePriorNetwork
 from training.shape_prior.batches import Batch
@@ -15,6 +17,7 @@ COLOR_WEIGHT = 0.1
 MOMENT_WEIGHT = 0.1
 POINT_WEIGHT = 0.5
 SYMMETRY_WEIGHT = 0.02
+LOWER_LR = "the last checkpoint stays as it is; begin another run with a lower --lr in another folder"
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,10 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
 
     Returns:
         Occupancy loss; intersection over union of matter, mean over samples and per family; mean absolute error of
-        hidden colors; mean angle between mirror planes in degrees.
+        hidden colors; mean angle between mirror planes in degrees. Without batches, nothing.
+
+    Raises:
+        FitDiverged: the network's output is not finite.
     """
     families: list[str] = []
     losses, overlaps, color, angles = [], [], [], []
@@ -82,14 +88,17 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
         families += batch.families
         color.append((color_at(knots[batch.ray], batch.depth) - batch.color.float() / 255).abs().mean().item())
         moment, _, _ = network.mirror(features.code)
+        if not moment.isfinite().all():
+            raise FitDiverged(f"the output on held-out samples is not finite; {LOWER_LR}")
         normal = torch.linalg.eigh(moment.double())[1][:, :, -1]
         known = batch.plane[:, :3].abs().amax(1) > 0
         cosine = (normal * batch.plane[:, :3]).sum(1)[known].abs().clamp(max=1)
         angles += cosine.acos().rad2deg().tolist()
-    figures = {"bce": _mean(losses), "iou": _mean(overlaps), "color": _mean(color), "plane_deg": _mean(angles)}
+    found = {"bce": losses, "iou": overlaps, "color": color, "plane_deg": angles}
+    figures = {name: mean(values) for name, values in found.items() if values}
     for family in sorted(set(families)):
         mine = [overlap for overlap, name in zip(overlaps, families, strict=True) if name == family]
-        figures[f"iou_{family}"] = _mean(mine)
+        figures[f"iou_{family}"] = mean(mine)
     return figures
 
 
@@ -98,7 +107,3 @@ def _overlaps(found: Tensor, truth: Tensor, owner: Tensor, count: int) -> list[f
     both = none.index_add(0, owner, (found & truth).float().sum(1))
     either = none.index_add(0, owner, (found | truth).float().sum(1))
     return [float(value) for value in (both / either.clamp(min=1)).tolist()]
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / max(1, len(values))

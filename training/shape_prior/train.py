@@ -12,10 +12,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from pickle import UnpicklingError
 from threading import Event
 from typing import Any
 
@@ -24,10 +26,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
-from dg4d_lib.shape_prior.network import ShapePriorConfig, ShapePriorNetwork, channels_last, load_network, save_network
+from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
+from dg4d_lib.shape_prior.network import (
+    ShapePriorConfig,
+    ShapePriorNetwork,
+    channels_last,
+    load_network,
+    not_finite,
+    save_network,
+)
 from training.shape_prior.batches import Batch, batches, make_batch
 from training.shape_prior.curves import draw_curves
-from training.shape_prior.losses import training_losses, validation_figures
+from training.shape_prior.losses import LOWER_LR, training_losses, validation_figures
 from training.shape_prior.muon import Muon
 
 VALIDATION_SEED = 1_000_003  # no training run uses it
@@ -82,6 +92,7 @@ class Run:
         self.average = deepcopy(self.network).eval()
         self.optimizers = make_optimizers(self.network, plan)
         self.shown = 0
+        self.gradient_norm = torch.zeros(())
         self.curve: list[dict[str, float]] = []
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
@@ -91,7 +102,7 @@ class Run:
         losses = training_losses(self.network, batch.to(self.device))
         self.network.zero_grad(set_to_none=True)
         losses.total().backward()
-        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.gradient_norm = nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         for optimizer in self.optimizers:
             optimizer.step()
         self.shown += len(batch.picture)
@@ -101,8 +112,27 @@ class Run:
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
         return {name: value.detach() for name, value in vars(losses).items()}
 
+    def require_finite(self) -> None:
+        """Refuse a run that diverged; the weights must also be finite in float16, in which they are shipped.
+
+        Raises:
+            FitDiverged: the gradient of the last step or a weight is not finite.
+        """
+        shipped = {name: value.half() for name, value in self.average.state_dict().items()}
+        broken = not_finite({"the gradient norm": self.gradient_norm, **self.network.state_dict(), **shipped})
+        if broken:
+            raise FitDiverged(
+                f"{broken[0]} is not finite after {self.shown} of {self.plan.samples} samples (--lr "
+                f"{self.plan.lr:g}); {LOWER_LR}"
+            )
+
     def save(self, folder: Path) -> None:
-        """Write the checkpoint and the averaged weights, each in one move."""
+        """Write the checkpoint and the averaged weights, each in one move.
+
+        Raises:
+            FitDiverged: as `require_finite`; nothing is written.
+        """
+        self.require_finite()
         state = {
             "plan": asdict(self.plan),
             "config": asdict(self.network.config),
@@ -119,8 +149,12 @@ class Run:
 
     @classmethod
     def load(cls, folder: Path, device: torch.device = CPU) -> "Run":
-        """Return the run of a checkpoint."""
-        state = torch.load(folder / CHECKPOINT, weights_only=True, map_location=device)
+        """Return the run of a checkpoint.
+
+        Raises:
+            BadInput: the checkpoint cannot be read, or holds weights that are not finite.
+        """
+        state = _read_checkpoint(folder / CHECKPOINT)
         run = cls(Plan(**state["plan"]), _config(state["config"]), device)
         run.network.load_state_dict(state["network"])
         run.average.load_state_dict(state["average"])
@@ -134,11 +168,12 @@ class Run:
 
         Args:
             path: checkpoint of a run, or weights in safetensors such as the shipped ones.
+
+        Raises:
+            BadInput: the file cannot be read, or holds weights that are not finite.
         """
-        if path.suffix == ".safetensors":
-            other = load_network(path).state_dict()
-        else:
-            other = torch.load(path, weights_only=True, map_location=CPU)["average"]
+        shipped = path.suffix == ".safetensors"
+        other = load_network(path).state_dict() if shipped else _read_checkpoint(path)["average"]
         own = self.network.state_dict()
         fitting = {name: value for name, value in other.items() if name in own and own[name].shape == value.shape}
         for network in (self.network, self.average):
@@ -172,6 +207,10 @@ def train(
         save_s: seconds between two checkpoints.
         console: where progress is shown.
         stop: when set, the run is saved after the step in hand and ends.
+
+    Raises:
+        FitDiverged: a gradient or a weight is not finite; the last checkpoint stays as it is.
+        BackendUnavailable: a process that makes shapes was killed; the run is saved.
     """
     plan = run.plan
     folder.mkdir(parents=True, exist_ok=True)
@@ -182,11 +221,12 @@ def train(
     saved, begun, first, sums = time.monotonic(), time.monotonic(), run.shown, Means()
     with Progress(*columns, console=console, disable=console is None or not console.is_terminal) as progress:
         task = progress.add_task("samples", total=plan.samples, completed=run.shown)
-        for batch in stream:
+        for batch in _saved_if_broken(stream, run, folder, stop):
             sums.add(run.step(batch))
             progress.update(task, completed=run.shown)
             last, stopped = run.shown + plan.batch > plan.samples, stop is not None and stop.is_set()
             if run.shown % every < plan.batch or last:
+                run.require_finite()
                 rate = (run.shown - first) / (time.monotonic() - begun)
                 run.curve.append(
                     {"shown": run.shown, "rate": rate, **sums.take(), **validation_figures(run.average, held_out)}
@@ -199,6 +239,20 @@ def train(
                 saved = time.monotonic()
             if stopped:
                 break
+
+
+def _saved_if_broken(stream: Iterator[Batch], run: Run, folder: Path, stop: Event | None) -> Iterator[Batch]:
+    """Yield the batches; save the run if the processes that make them end, with the trainer or without it."""
+    try:
+        yield from stream
+    except BrokenProcessPool as error:
+        if run.shown:
+            run.save(folder)
+        if stop is None or not stop.is_set():
+            raise BackendUnavailable(
+                f"a process that makes shapes was killed after {run.shown} of {run.plan.samples} samples, most likely "
+                "for lack of memory; run the same command again, with fewer --workers"
+            ) from error
 
 
 class Means:
@@ -235,12 +289,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train the shape prior, or go on where a run in the folder stopped."""
     parser = argparse.ArgumentParser(prog="python -m training.shape_prior.train", description=main.__doc__)
     parser.add_argument("folder", type=Path, help="checkpoint, weights and curves; a checkpoint in it is resumed")
-    options, sizes = asdict(Plan()), ShapePriorConfig()  # no defaults in the parser: a resumed run has its own values
-    for name, value in options.items():
+    for name, value in asdict(Plan()).items():  # no defaults in the parser: a resumed run has its own values
         parser.add_argument(_option(name), type=type(value), default=argparse.SUPPRESS, help=f"default: {value}")
     parser.add_argument("--widths", type=int, nargs=4, default=argparse.SUPPRESS)
     parser.add_argument("--layers", type=int, default=argparse.SUPPRESS)
-    parser.add_argument("--device", type=torch.device, default=CPU, help="cpu or cuda")
+    parser.add_argument("--device", type=_device, default=CPU, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that make shapes")
     parser.add_argument("--every", type=int, default=16_000, help="samples between two validations")
@@ -251,25 +304,52 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_freed_memory()
     torch.set_num_threads(given.threads)
     torch.set_float32_matmul_precision("high")  # TF32 on GPUs; processors have none
-    if (given.folder / CHECKPOINT).exists():
-        run = Run.load(given.folder, given.device)
-        _check_resumed(parser, given, run)
-        run.plan = replace(run.plan, samples=getattr(given, "samples", run.plan.samples))
-        _log.info("resumed at %d of %d samples", run.shown, run.plan.samples)
-    else:
-        plan = Plan(**{name: getattr(given, name, value) for name, value in options.items()})
-        if plan.samples < plan.batch:
-            parser.error(f"--samples is {plan.samples}, less than one batch. Give at least --batch ({plan.batch}).")
-        widths, layers = getattr(given, "widths", sizes.widths), getattr(given, "layers", sizes.layers)
-        run = Run(plan, ShapePriorConfig(widths=tuple(widths), layers=layers), given.device)
-        if given.warm_start:
-            _log.info("warm start; new: %s", run.warm_start(given.warm_start))
+    try:
+        run = _resumed(parser, given) if (given.folder / CHECKPOINT).exists() else _new_run(parser, given)
+    except BadInput as error:
+        parser.error(str(error))
     parameters = sum(value.numel() for value in run.network.parameters())
     _log.info("%.2f million parameters, pid %d", parameters / 1e6, os.getpid())
     stop = Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
+    try:
+        train(run, given.folder, workers=given.workers, every=given.every, console=Console(stderr=True), stop=stop)
+    except (FitDiverged, BackendUnavailable) as error:
+        parser.exit(1, f"{parser.prog}: training ended: {error}\n")
+
+
+def _resumed(parser: argparse.ArgumentParser, given: argparse.Namespace) -> Run:
+    run = Run.load(given.folder, given.device)
+    _check_resumed(parser, given, run)
+    run.plan = replace(run.plan, samples=getattr(given, "samples", run.plan.samples))
+    _log.info("resumed at %d of %d samples", run.shown, run.plan.samples)
+    return run
+
+
+def _new_run(parser: argparse.ArgumentParser, given: argparse.Namespace) -> Run:
+    plan = Plan(**{name: getattr(given, name, value) for name, value in asdict(Plan()).items()})
+    if plan.samples < plan.batch:
+        parser.error(f"--samples is {plan.samples}, less than one batch. Give at least --batch ({plan.batch}).")
+    sizes = ShapePriorConfig()
+    widths, layers = getattr(given, "widths", sizes.widths), getattr(given, "layers", sizes.layers)
+    run = Run(plan, ShapePriorConfig(widths=tuple(widths), layers=layers), given.device)
+    if given.warm_start:
+        _log.info("warm start; new: %s", run.warm_start(given.warm_start))
+    return run
+
+
+def _device(text: str) -> torch.device:
+    """Return the device that an option names."""
+    try:
+        device = torch.device(text)
+    except RuntimeError:
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no device for training; give cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise argparse.ArgumentTypeError(f"{text!r}: torch finds {torch.cuda.device_count()} CUDA devices; give cpu")
+    return device
 
 
 def _option(name: str) -> str:
@@ -307,6 +387,29 @@ def _check_resumed(parser: argparse.ArgumentParser, given: argparse.Namespace, r
         parser.error(f"--warm-start is for new runs; {place} is resumed. Leave it out, or name another folder.")
     if samples < run.shown:
         parser.error(f"--samples is {samples}, but {place} was shown {run.shown}. Give at least as many.")
+
+
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    """Return the state of a run on the processor, where optimizers keep their step counts.
+
+    Raises:
+        BadInput: the file is no checkpoint of a run, or its weights are not finite.
+    """
+    try:
+        state = torch.load(path, weights_only=True, map_location=CPU)
+        broken = not_finite({**state["network"], **state["average"]})
+    except (OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError, UnpicklingError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise BadInput(
+            f"{path} cannot be read as a checkpoint of this trainer: {reason}; give another file or, in the "
+            "folder of a run, remove it to begin a new one"
+        ) from error
+    if broken:
+        raise BadInput(
+            f"{path} is of a run that diverged: {broken[0]} has values that are not finite; begin a new run with a "
+            "lower --lr in another folder"
+        )
+    return dict(state)
 
 
 def _on_cpu(value: Any) -> Any:

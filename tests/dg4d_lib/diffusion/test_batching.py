@@ -64,8 +64,16 @@ def test_a_failure_in_the_middle_repeats_nothing_that_was_done() -> None:
     assert seen == [0, 4, 5, 6]
 
 
-def test_a_processor_without_memory_counts_too() -> None:
-    error = RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+        RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),
+        torch.AcceleratorError("CUDA error: out of memory"),
+    ],
+)
+def test_memory_that_ran_out_outside_of_the_allocator_of_torch_counts_too(error: RuntimeError) -> None:
     batches = MicroBatches("views", 4)
     assert len(batches.run(Memory(2, error), 4)) == 2
 

@@ -9,6 +9,7 @@ from safetensors.torch import load_file, save_file
 
 from dg4d_lib.diffusion import components, noise_schedule
 from dg4d_lib.diffusion.components import Placement
+from dg4d_lib.diffusion.video_model import start_index
 from dg4d_lib.errors import BackendUnavailable, BadInput
 
 CPU = torch.device("cpu")
@@ -88,6 +89,32 @@ def test_half_precision_reads_the_variant_and_others_the_whole(tmp_path: Path) -
     assert components.weights_file(tmp_path, half=True).name == "diffusion_pytorch_model.fp16.safetensors"
 
 
+@pytest.mark.parametrize("variant", [None, "fp16"])
+@pytest.mark.parametrize("name", LOADERS)
+def test_shards_are_read_through_their_index(name: str, variant: str | None, whole: Path, tmp_path: Path) -> None:
+    part = LOADERS[name](whole, FP32)
+    part.save_pretrained(tmp_path / name, max_shard_size="20KB", variant=variant)
+    index = components.weights_file(tmp_path / name, ("diffusion_pytorch_model", "model"))
+    assert index.name.endswith(f".safetensors.index{f'.{variant}' if variant else ''}.json")
+    read = components.read_tensors(index)
+    again = LOADERS[name](tmp_path, FP32).state_dict()
+    for key, value in part.state_dict().items():
+        assert torch.equal(again[key], value) and torch.equal(read[key], value)
+
+
+def test_an_index_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
+    index = tmp_path / "diffusion_pytorch_model.safetensors.index.json"
+    for weight_map, message in (
+        ({"a": "lost.safetensors"}, "lost.safetensors cannot be read"),
+        ({"a": "../other.safetensors"}, "names a shard outside of its folder"),
+        (["a"], "cannot be read"),
+        ({"a": 1}, "cannot be read"),
+    ):
+        index.write_text(json.dumps({"weight_map": weight_map}))
+        with pytest.raises(BadInput, match=message):
+            components.read_tensors(index)
+
+
 @pytest.mark.parametrize("name", LOADERS)
 def test_pickled_tensors_are_read_too(name: str, copy: Path) -> None:
     file = copy / name / FILES[name]
@@ -145,6 +172,21 @@ def test_a_linear_layer_is_read_from_either_format(suffix: str, tmp_path: Path) 
         components.read_linear(tmp_path, "other", FP32)
 
 
+@pytest.mark.parametrize("steps", [*range(1, 41), 142, 143, 166, 334, 400, 500, 900, 999])
+def test_a_sampler_starts_near_pure_noise_whatever_its_number_of_steps(steps: int) -> None:
+    timesteps = noise_schedule.ddim_timesteps(steps)
+    assert len(set(timesteps)) == steps and sorted(timesteps, reverse=True) == list(timesteps)
+    assert 901 <= timesteps[0] < 1000 and (timesteps[-1] == 1 or steps == 1)
+    assert float(noise_schedule.alphas_cumprod()[timesteps[0]]) < 0.0141
+
+
+@pytest.mark.parametrize("steps", [20, 30, 50, 143, 334, 400, 500])
+@pytest.mark.parametrize("strength", [0.95, 0.5, 0.05])
+def test_a_strength_is_that_share_of_the_schedule(steps: int, strength: float) -> None:
+    timestep = noise_schedule.ddim_timesteps(steps)[start_index(steps, strength)]
+    assert 900 * strength - 1000 / steps <= timestep <= 1000 * strength + 1
+
+
 def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "diffusion_pytorch_model.bin"
     torch.save({"proj.weight": tiny_weights.write_scheduler}, file)
@@ -160,6 +202,12 @@ def test_a_model_with_another_schedule_is_refused(copy: Path) -> None:
         tiny_weights.write_scheduler(copy / "scheduler", **change)
         with pytest.raises(BadInput, match=str(next(iter(change.values())))):
             noise_schedule.require_schedule(copy, expected)
+    for change in ({"trained_betas": [0.001] * 1000}, {"rescale_betas_zero_snr": True}):
+        tiny_weights.write_scheduler(copy / "scheduler", **change)
+        with pytest.raises(BadInput, match=f"{next(iter(change))}=True"):
+            noise_schedule.require_schedule(copy, expected)
+    tiny_weights.write_scheduler(copy / "scheduler", trained_betas=None, rescale_betas_zero_snr=False)
+    noise_schedule.require_schedule(copy, expected)
     (copy / "scheduler" / "scheduler_config.json").write_text(json.dumps({"beta_start": 0.1}))
     with pytest.raises(BadInput, match="no scheduler"):
         noise_schedule.read_schedule(copy)

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,44 @@ def test_a_file_for_another_network_is_refused(tensors: dict[str, torch.Tensor],
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, tmp_path / "lora.safetensors")
     with pytest.raises(BadInput, match=message):
         merge_lora(network(), tmp_path, 1.0)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "transformer.block.to_q.lora_magnitude_vector",  # DoRA of PEFT
+        "diffusion_model.block.to_q.dora_scale",  # DoRA of kohya
+        "transformer.block.to_q.lora_B.bias",
+        "block.to_q.diff",
+        "block.to_q.diff_b",
+        "block.to_k.lokr_w1",
+        "block.norm.weight",
+    ],
+)
+def test_tensors_that_a_merge_would_drop_are_refused(key: str, tmp_path: Path) -> None:
+    tensors = {"block.to_q.lora_A.weight": DOWN, "block.to_q.lora_B.weight": UP, key: torch.ones(2)}
+    save_file(tensors, tmp_path / "lora.safetensors")
+    made = network()
+    with pytest.raises(BadInput, match=rf"is more than a LoRA: {re.escape(key)} \(1 such tensors\) cannot be merged"):
+        merge_lora(made, tmp_path, 1.0)
+    assert not made["block"]["to_q"].weight.any()
+
+
+def test_dora_in_the_metadata_is_refused(tmp_path: Path) -> None:
+    stored = json.dumps({"transformer.lora_alpha": 4, "transformer.use_dora": True})
+    with pytest.raises(BadInput, match="use_dora in its metadata cannot be merged"):
+        merge_lora(network(), save_with_metadata(tmp_path, stored), 1.0)
+
+
+@pytest.mark.parametrize("broken", ["lora_A.weight", "lora_B.weight", "alpha"])
+def test_numbers_that_are_not_finite_are_refused(broken: str, tmp_path: Path) -> None:
+    tensors = {"lora_A.weight": DOWN.clone(), "lora_B.weight": UP.clone(), "alpha": torch.ones(1)}
+    tensors[broken].view(-1)[0] = math.nan
+    save_file({f"block.to_q.{name}": tensor for name, tensor in tensors.items()}, tmp_path / "lora.safetensors")
+    made = network()
+    with pytest.raises(BadInput, match=rf"block\.to_q\.{re.escape(broken)} has values that are not finite"):
+        merge_lora(made, tmp_path, 1.0)
+    assert not made["block"]["to_q"].weight.any()
 
 
 def test_a_folder_without_one_file_is_refused(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ import torch
 from PIL import Image
 from tiny_svd import SCHEDULE, save_tiny_svd, tiny_svd
 
-from dg4d_lib.diffusion import batching, video_model
+from dg4d_lib.diffusion import video_model
 from dg4d_lib.diffusion.single_token_attention import SingleTokenProcessor
 from dg4d_lib.diffusion.video_model import VideoModel, karras_sigmas, pred_original_sample, start_index
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, is_out_of_memory
 from dg4d_lib.settings import VideoModelSettings
 
 CPU = torch.device("cpu")
@@ -134,7 +134,7 @@ def test_where_memory_runs_out_less_is_done_at_once_and_said(
     torch.testing.assert_close(video, generated(model, pixels / 255, 5), rtol=0, atol=2e-5)
     assert any("memory ran out with 2 videos" in note for note in tight.notes())
     assert not model.notes()
-    assert batching.is_out_of_memory(torch.OutOfMemoryError("no room"))
+    assert is_out_of_memory(torch.OutOfMemoryError("no room"))
 
 
 def test_a_budget_says_how_much_goes_through_at_once(

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import operator
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -284,6 +285,23 @@ def test_another_frame_is_another_condition(networks: Zero123) -> None:
     prior, images = networks.conditioned_on(pictures(2, 64), PAPER), pictures(1, 96)
     camera = OrbitCamera(10, 40)
     assert judged(prior, images, [GuidanceView(camera, 0)])[0] != judged(prior, images, [GuidanceView(camera, 1)])[0]
+
+
+@pytest.mark.parametrize("part", ["vae.encoder", "image_encoder"])
+def test_frames_on_which_the_networks_overflow_are_named(
+    part: str, networks: Zero123, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = operator.attrgetter(part)(networks)
+    forward = network.forward
+
+    def overflow(pixels: torch.Tensor) -> object:
+        found = forward(pixels)
+        (found if isinstance(found, torch.Tensor) else found.image_embeds)[1] = torch.nan
+        return found
+
+    monkeypatch.setattr(network, "forward", overflow)
+    with pytest.raises(BadInput, match=r"of 1 of 3 frames is not finite \(frame 1\).* to bf16 or fp32"):
+        networks.conditioned_on(pictures(3, 64), PAPER)
 
 
 @pytest.mark.parametrize("frame", [-1, 2])

@@ -100,5 +100,30 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         load_network(tmp_path / "n.safetensors")
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(value: float, network: ShapePriorNetwork, tmp_path: Path) -> None:
+    with torch.no_grad():
+        network.stem.bias[3] = value
+    save_network(network, tmp_path / "n.safetensors")
+    with pytest.raises(BadInput, match=r"n\.safetensors is damaged: stem\.bias has values that are not finite"):
+        load_network(tmp_path / "n.safetensors")
+
+
+def test_weights_that_cannot_be_read_are_named(network: ShapePriorNetwork, tmp_path: Path) -> None:
+    file = tmp_path / "n.safetensors"
+    with pytest.raises(BadInput, match=r"n\.safetensors cannot be read as weights of the shape prior"):
+        load_network(file)
+    save_network(network, file)
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(BadInput, match=r"n\.safetensors cannot be read as weights of the shape prior"):
+        load_network(file)
+
+
+@pytest.mark.parametrize("widths", [(8, 8, 8, 8), (12, 16, 32, 32), (8, 16, 32, 48), (0, 8, 8, 32)])
+def test_widths_that_do_not_fit_are_refused(widths: tuple[int, int, int, int]) -> None:
+    with pytest.raises(BadInput, match=f"widths {' '.join(map(str, widths))} do not fit .* 8 .* 32 "):
+        ShapePriorConfig(widths)
+
+
 def test_the_shipped_size_is_at_most_eight_megabytes() -> None:
     assert 2 * sum(value.numel() for value in ShapePriorNetwork().parameters()) <= 8e6

@@ -1,9 +1,14 @@
 """Training: it learns, goes on where it stopped, and gives the same weights again."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children
 from pathlib import Path
 from threading import Event
 
@@ -12,10 +17,11 @@ import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy
 
+from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
 from dg4d_lib.shape_prior.network import ShapePriorConfig, load_network
 from training.shape_prior import train as training
-from training.shape_prior.batches import batches, make_batch
-from training.shape_prior.losses import color_at
+from training.shape_prior.batches import Batch, batches, make_batch
+from training.shape_prior.losses import Losses, color_at, validation_figures
 from training.shape_prior.muon import orthogonalized
 
 TINY = ShapePriorConfig(widths=(8, 16, 32, 32), blocks=(1, 1, 1), layers=1, head=32)
@@ -90,6 +96,90 @@ def test_a_run_that_is_asked_to_stop_saves_where_it_stands(tmp_path: Path) -> No
     assert training.Run.load(tmp_path).shown == 4
 
 
+def test_a_run_that_is_asked_to_stop_saves_though_its_workers_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> Iterator[Batch]:
+        yield make_batch(1, 0, 4, 16)
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(training, "batches", broken)
+    with pytest.raises(BackendUnavailable, match=r"was killed after 4 of 32 samples, .* run the same command again"):
+        training.train(training.Run(plan(32, held_out=0), TINY), tmp_path / "killed")
+    stop = Event()
+    run = training.Run(plan(32, held_out=0), TINY)
+    step = run.step
+    monkeypatch.setattr(run, "step", lambda batch: (step(batch), setattr(run, "shown", 8))[0])
+
+    def broken_later(*_: object) -> Iterator[Batch]:
+        yield make_batch(1, 0, 4, 16)
+        stop.set()  # the signal comes while the trainer waits
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(training, "batches", broken_later)
+    training.train(run, tmp_path / "stopped", stop=stop)
+    assert training.Run.load(tmp_path / "killed").shown == 4
+    assert training.Run.load(tmp_path / "stopped").shown == 8
+
+
+def test_a_run_that_diverges_leaves_its_last_checkpoint(tmp_path: Path) -> None:
+    run = training.Run(plan(12, lr=1e20, warmup=1, held_out=0, rays=16), TINY)
+    run.save(tmp_path)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(FitDiverged, match=r"not finite after \d+ of 12 samples \(--lr 1e\+20\); the last checkpoint"):
+        training.train(run, tmp_path, workers=0)
+    assert before == {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+
+def test_a_gradient_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    run = training.Run(plan(12), TINY)
+    run.gradient_norm = torch.tensor(torch.nan)
+    with pytest.raises(FitDiverged, match="the gradient norm is not finite"):
+        run.save(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_network_whose_output_is_not_finite_is_not_validated() -> None:
+    network = training.Run(plan(12), TINY).average
+    with torch.no_grad():
+        network.plane.bias[0] = torch.inf
+    with pytest.raises(FitDiverged, match="the output on held-out samples is not finite"):
+        validation_figures(network, [make_batch(1, 0, 1, 16)])
+
+
+def test_a_run_without_held_out_samples_has_no_validation_figures(tmp_path: Path) -> None:
+    training.train(training.Run(plan(4, held_out=0, rays=16), TINY), tmp_path, workers=0)
+    (row,) = json.loads((tmp_path / "curves.json").read_text())
+    assert set(row) == {"shown", "rate", *(f"train_{name}" for name in Losses.__dataclass_fields__)}
+
+
+def broken_checkpoint(path: Path) -> Path:
+    """A checkpoint of a run that diverged, as earlier versions wrote it."""
+    training.Run(plan(32), TINY).save(path.parent)
+    state = torch.load(path.parent / training.CHECKPOINT, weights_only=True)
+    state["average"]["stem.bias"][0] = torch.nan
+    torch.save(state, path)
+    return path
+
+
+def test_a_checkpoint_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    path = broken_checkpoint(tmp_path / training.CHECKPOINT)
+    for read in (lambda: training.Run.load(tmp_path), lambda: training.Run(plan(32), TINY).warm_start(path)):
+        with pytest.raises(BadInput, match=r"is of a run that diverged: stem\.bias has values that are not finite"):
+            read()
+
+
+@pytest.mark.filterwarnings("ignore:.*is a no-op:UserWarning")
+def test_optimizers_of_a_resumed_run_count_their_steps_on_the_processor(tmp_path: Path) -> None:
+    run = training.Run(plan(32), TINY)
+    run.step(make_batch(1, 0, 4, 16))
+    run.save(tmp_path)
+    resumed = training.Run.load(tmp_path, torch.device("meta"))  # in place of a GPU, which would be synchronized
+    states = resumed.optimizers[1].state.values()
+    assert {state["step"].device.type for state in states} == {"cpu"}
+    assert {state["exp_avg"].device.type for state in states} == {"meta"}
+
+
 @pytest.fixture
 def process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the trainer from changing this process."""
@@ -112,6 +202,12 @@ def process(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--lr nan", "--lr is nan. Give more than 0."),
         ("--workers=-1", "--workers is -1. Give at least 0."),
         ("--seed=-1", "--seed is -1. Give at least 0."),
+        ("--device gpu", "'gpu' is no device for training; give cpu or cuda"),
+        ("--device meta", "'meta' is no device for training; give cpu or cuda"),
+        ("--device cuda:99", "CUDA devices; give cpu"),
+        ("--widths 8 8 8 8", "widths 8 8 8 8 do not fit the network"),
+        ("--warm-start nosuch.pt", "nosuch.pt cannot be read as a checkpoint"),
+        ("--warm-start nosuch.safetensors", "nosuch.safetensors cannot be read as weights"),
     ],
 )
 def test_an_option_out_of_its_range_is_refused_by_name(
@@ -159,6 +255,50 @@ def test_a_run_goes_on_with_its_own_settings(
     monkeypatch.setattr(training, "train", lambda run, *_, **__: plans.append(run.plan))
     training.main([str(tmp_path), *given.split()])
     assert plans == [plan(samples)]
+
+
+@pytest.mark.usefixtures("process")
+def test_a_checkpoint_that_is_cut_off_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    training.Run(plan(32), TINY).save(tmp_path)
+    file = tmp_path / training.CHECKPOINT
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(SystemExit):
+        training.main([str(tmp_path)])
+    assert f"{file} cannot be read as a checkpoint of this trainer" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("process")
+def test_a_run_that_diverges_ends_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    training.Run(plan(12, lr=1e20, warmup=1, held_out=0, rays=16), TINY).save(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        training.main([str(tmp_path), "--workers", "0"])
+    assert ended.value.code == 1
+    assert "training ended: " in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_trainer_saves_when_its_process_group_is_asked_to_end(tmp_path: Path) -> None:
+    options = "--widths 8 16 32 32 --layers 1 --batch 2 --rays 8 --held-out 0 --samples 40000 --every 2"
+    command = [sys.executable, "-m", "training.shape_prior.train", str(tmp_path), *options.split()]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as trainer:
+        assert trainer.stderr is not None
+        while '"shown"' not in trainer.stderr.readline():
+            assert trainer.poll() is None
+        os.killpg(trainer.pid, signal.SIGTERM)
+        _, said = trainer.communicate(timeout=60)
+    assert trainer.returncode == 0 and "Traceback" not in said
+    assert training.Run.load(tmp_path).shown >= 2
+
+
+@pytest.mark.slow
+def test_no_worker_is_left_when_one_is_killed() -> None:
+    made = batches(1, 0, 1000, 1, 16, workers=2)
+    next(made)
+    killed, other = active_children()
+    killed.kill()
+    with pytest.raises(BrokenProcessPool):
+        list(made)
+    assert not other.is_alive()
 
 
 @pytest.mark.slow
