@@ -123,7 +123,7 @@ def merged_graph(cloud: Gaussians, graph: ControlGraph, most: int) -> tuple[Gaus
 
 
 def motion_note(motion: NodeMotion, most_parts: int) -> str:
-    """Return what the motion of sides that the video does not show follows from."""
+    """Return a note on how the motion of sides that the video does not show was inferred."""
     parts = int(motion.parts.max()) + 1
     return RIGID_NOTE.format(parts, "s" * (parts != 1)) if parts <= most_parts else NOTE
 

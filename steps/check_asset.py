@@ -176,7 +176,7 @@ def _drawn(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera]) -> F
 
 
 def _pictures(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera], finer: int) -> RgbaImages:
-    """Draw an asset so many times finer, and reduce the pictures to the size of the cameras."""
+    """Render an asset at a multiple of the resolution, then reduce the pictures to the size of the cameras."""
     size = (cameras[0].height, cameras[0].width)
     fine = [replace(camera, width=finer * camera.width, height=finer * camera.height) for camera in cameras]
     drawn = resize(_drawn(draw, positions, fine)[..., :4], size)
@@ -205,7 +205,7 @@ class _Rest:
 
     @classmethod
     def of(cls, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], own_model: bool) -> "_Rest":
-        """Look at a mesh at rest; nothing counts of what a model of the user's own has there."""
+        """Measure the defects of a mesh at rest; those of a user's own model do not count."""
         rest = vertices.numpy()
         joined, corners = join_seams(rest, faces.numpy())
         finder = DefectFinder(corners, rest[joined])

@@ -94,7 +94,7 @@ def _use_footage(job: Job, subject: Float[Tensor, "h w 4"]) -> StepReport:
 
 
 def _hint(job: Job) -> DepthHint:
-    """Return what the user knows about the depth of the subject."""
+    """Return the user's hints at the depth of the subject."""
     field = job.inputs.get("depth_field")
     return DepthHint(job.settings.turn_deg or None, read_depth_field(field) if field else None)
 

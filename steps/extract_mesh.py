@@ -323,7 +323,7 @@ def _guided(
 
 
 def _note(strands: tuple[Tube, ...]) -> list[str]:
-    """Tell how many strands a mesh has, if any."""
+    """Return a note with the number of strands, if the mesh has any."""
     return (
         [f"strands of the video that are too thin for its grid and grew out of it: {len(strands)}"] if strands else []
     )

@@ -38,7 +38,7 @@ FEW = 4  # views; among more, thin parts seen edge-on fill little of single silh
 LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
 GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
 INPUT, TURNTABLE = "the input", "the turntable"  # names for messages
-Moments = list[list[KnownView]]  # views by frame
+ViewsByFrame = list[list[KnownView]]  # views by frame
 
 
 def run(job: Job) -> StepReport:
@@ -56,9 +56,9 @@ def run(job: Job) -> StepReport:
         job.progress(1, 3, {})
         network = open_network(settings.matting)
         known = _Reader(folder / "views", settings, inputs, job.inputs, network.segmenter)
-        moments, notes = known.turntable(given) if given.turntable else known.views(given)
+        views_by_frame, notes = known.turntable(given) if given.turntable else known.views(given)
     job.progress(2, 3, {})
-    first = [known_view(inputs[0], name=INPUT), *moments[0]]
+    first = [known_view(inputs[0], name=INPUT), *views_by_frame[0]]
     picture = picture_of(first)
     found = agreement(first)
     try:
@@ -69,9 +69,9 @@ def run(job: Job) -> StepReport:
     write_png(job.outputs["picture"], picture)
     if found.mean > RELIABLE:
         gains = exposure_gains(first)[1:]
-        notes = (*notes, *exposure_notes(moments[0], gains))
-        moments = [[brightened(*pair) for pair in zip(views, gains, strict=True)] for views in moments]
-    write_bank(job.outputs["known_views"], moments, job.pictures)
+        notes = (*notes, *exposure_notes(views_by_frame[0], gains))
+        views_by_frame = [[brightened(*pair) for pair in zip(views, gains, strict=True)] for views in views_by_frame]
+    write_bank(job.outputs["known_views"], views_by_frame, job.pictures)
     job.progress(3, 3, {})
     used = network if known.used_network else LoadedNetwork()
     return StepReport(weights=used.digests, licenses=used.licenses, notes=notes)
@@ -103,7 +103,7 @@ class _Reader:
         self.settings, self.box = settings.model_copy(update={"box": ()}), settings.box
         self.used_network = False
 
-    def views(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+    def views(self, given: GivenViews) -> tuple[ViewsByFrame, tuple[str, ...]]:
         """Return the views of pictures and of videos beside the input's."""
         sources = [self._read(view.file, view.name) for view in given.views]
         moving = [source.kind == "video" for source in sources]
@@ -122,7 +122,7 @@ class _Reader:
             dict.fromkeys(note for each in prepared for note in each.notes)
         )
 
-    def turntable(self, given: GivenViews) -> tuple[Moments, tuple[str, ...]]:
+    def turntable(self, given: GivenViews) -> tuple[ViewsByFrame, tuple[str, ...]]:
         """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
         source = self._read(given.turntable, TURNTABLE, TURNTABLE_FRAMES)
         check_turn(source)
@@ -136,7 +136,7 @@ class _Reader:
             views, notes = [*alone, *more], (*notes, *other_notes)
         return [views], notes
 
-    def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[Moments, tuple[str, ...]]:
+    def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[ViewsByFrame, tuple[str, ...]]:
         """Return the views of synchronized videos by frame."""
         own = self._source()
         for view, source in zip(given.views, sources, strict=True):

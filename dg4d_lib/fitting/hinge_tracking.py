@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -101,8 +102,8 @@ def track_hinge(
     start = hinge.opened(replace(rigid, parts=parts), found.angles)
     ends = graph.nodes[graph.edges]
     held = (parts[graph.edges[:, 0]] != parts[graph.edges[:, 1]]) & (hinge.distances(ends.mean(1)) < NEAR)
-    edges, told = torch.nonzero(held)[:, 0], lambda done, values: report_after(report, ITERATIONS, done, values)
-    rigid = fit_rigid_motion(fit, start, told, edges)
+    edges = torch.nonzero(held)[:, 0]
+    rigid = fit_rigid_motion(fit, start, partial(report_after, report, ITERATIONS), edges)
     opened = rigid.of_nodes(fit.graph)
     if fit.difference(opened) > allowed:
         return None

@@ -28,7 +28,7 @@ class Pose:
 
     @classmethod
     def rest(cls, count: int) -> "Pose":
-        """Return the pose of so many nodes at rest."""
+        """Return the rest pose of `count` nodes."""
         return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
 
     def quats(self) -> Float[Tensor, "m 4"]:

@@ -203,7 +203,7 @@ class _Moments:
 
 
 def _rigid(parts: Int[np.ndarray, " m"], moments: _Moments, graph: ControlGraph) -> RigidMotion:
-    """Return the rigid motions of the parts of the nodes that are nearest to what the sums over them are of."""
+    """Return the rigid motion of every part that fits its nodes best."""
     turns = Rotation.from_matrix(moments.rotations().reshape(-1, 3, 3)).as_quat(scalar_first=True)
     quats = turns.reshape(len(moments.count), -1, 4).swapaxes(0, 1)
     places = moments.moved / moments.count[:, None, None]

@@ -54,6 +54,6 @@ def concatenate(clouds: Sequence[Gaussians]) -> Gaussians:
 
 
 def thinned(cloud: Gaussians, step: int) -> Gaussians:
-    """Return every so many-th Gaussian of one state, larger to cover as much."""
+    """Return every n-th Gaussian of one state, enlarged to cover the same area."""
     thin = cloud.subset(slice(None, None, step))
     return replace(thin, log_scales=thin.log_scales + 0.5 * math.log(step))

@@ -342,7 +342,7 @@ def _cross_large(points, faces, low, high, large, searched, marked):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _apart(low, high, i, j):
-    """Tell whether the bounding boxes of two faces have no place in common."""
+    """Return whether the bounding boxes of two faces have no place in common."""
     apart = False
     for axis in range(3):
         apart |= low[i, axis] > high[j, axis] or low[j, axis] > high[i, axis]
@@ -352,7 +352,7 @@ def _apart(low, high, i, j):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _faces_cross(points, a, b):
-    """Tell whether an edge of one face passes through the other; edges that end on it at a shared corner do not."""
+    """Return whether an edge of one face passes through the other; edges that end on it at a shared corner do not."""
     if _on_one_side(points, a, b) or _on_one_side(points, b, a):  # most pairs
         return False
     return _edges_cross(points, a, b) or _edges_cross(points, b, a)
@@ -361,7 +361,7 @@ def _faces_cross(points, a, b):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _on_one_side(points, a, b):
-    """Tell whether the plane of the first face leaves the second one on one side, shared corners aside."""
+    """Return whether the plane of the first face leaves the second one on one side, shared corners aside."""
     below, above = False, False
     for corner in b:
         if corner not in (a[0], a[1], a[2]):
@@ -387,7 +387,7 @@ def _edges_cross(points, a, b):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _segment_crosses(p, q, a, b, c):
-    """Tell whether the open segment pq passes through the inside of the triangle, by signs of volumes."""
+    """Return whether the open segment pq passes through the inside of the triangle, by signs of volumes."""
     if _volume(a, b, c, p) * _volume(a, b, c, q) >= 0:
         return False
     u, v, w = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)

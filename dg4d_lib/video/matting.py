@@ -308,12 +308,12 @@ def _color_odds(lab: Float[ndarray, "t h w 3"], estimate: Float[Tensor, "t h w"]
 def _without_false_holes(
     alpha: Float[ndarray, "h w"], segmented: Bool[ndarray, "h w"], reach: int
 ) -> Float[ndarray, "h w"]:
-    """Remove specks and parts unknown to the segmentation; make solid what it has and the outline encloses.
+    """Remove specks and parts outside of the segmentation; fill holes that it and the outline enclose.
 
-    Highlights are such holes; things of the subject's colors elsewhere in a picture are such parts.
+    Highlights are such holes; objects of the subject's colors elsewhere in a picture are such parts.
 
     Args:
-        alpha: refined by colors, which know no inside.
+        alpha: refined by colors alone.
         segmented: mask of the segmentation.
         reach: distance from the outline from which alpha is solid, pixels.
     """

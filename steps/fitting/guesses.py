@@ -14,7 +14,7 @@ from steps.fitting.priors import subject_hint, subject_shapes
 
 
 def guessed_shapes(video: DrivingVideo, pose: Path | None, depth: Path | None, turn_deg: float) -> SubjectShapes:
-    """Return what the shape network says of every frame.
+    """Return the shape network's guess for every frame.
 
     Args:
         video: of the camera at azimuth and elevation 0.

@@ -249,7 +249,7 @@ def _carried_shapes(
 
 
 def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -> Fields:
-    """Return what the shape network says of every frame; the video carries what it says of the first one along."""
+    """Return the shape network's field for every frame; the optical flow carries that of the first frame along."""
     fields = ShapeFields(packaged.packaged_network(), cutouts, hint)
     return CarriedFields(fields, None, cutouts, MOST_STRAIN) if len(cutouts) > 1 else fields
 

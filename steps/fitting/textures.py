@@ -42,8 +42,8 @@ def colored(
     unwrapped = unwrap(vertices.numpy(), faces.numpy(), settings.texture_size, settings.unwrap, effort)
     sources, corners, uvs = map(torch.from_numpy, unwrapped)
     normals = vertex_normals(vertices, faces)[sources]
-    moments = footage(sources)
-    texture = bake_texture(vertices[sources], normals, corners, uvs, draw, settings, moments)
+    surfaces = footage(sources)
+    texture = bake_texture(vertices[sources], normals, corners, uvs, draw, settings, surfaces)
     return TexturedMesh(vertices[sources], corners, uvs, texture), sources
 
 

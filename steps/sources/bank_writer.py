@@ -14,20 +14,20 @@ from steps.artifacts.media import write_png, write_zip
 from steps.sources.banks import BANK_JSON
 
 
-def write_bank(path: Path, moments: Sequence[Sequence[KnownView]], scratch: Path) -> None:
+def write_bank(path: Path, views_by_frame: Sequence[Sequence[KnownView]], scratch: Path) -> None:
     """Write views of consecutive frames, from frame 0, as a zip.
 
     Args:
         path: zip to write.
-        moments: views by frame; the same cameras in every frame, square pictures of one size.
+        views_by_frame: views by frame; the same cameras in every frame, square pictures of one size.
         scratch: folder for a picture.
     """
-    columns = math.ceil(math.sqrt(len(moments)))
-    rows = math.ceil(len(moments) / columns)
+    columns = math.ceil(math.sqrt(len(views_by_frame)))
+    rows = math.ceil(len(views_by_frame) / columns)
     sheets, views = [], []
-    for number, view in enumerate(moments[0]):
+    for number, view in enumerate(views_by_frame[0]):
         name = f"{number:03d}.png"
-        write_png(scratch / name, _sheet([moment[number].cutout for moment in moments], rows, columns))
+        write_png(scratch / name, _sheet([views[number].cutout for views in views_by_frame], rows, columns))
         sheets.append((name, (scratch / name).read_bytes()))
         (scratch / name).unlink()
         camera = view.camera
@@ -41,8 +41,8 @@ def write_bank(path: Path, moments: Sequence[Sequence[KnownView]], scratch: Path
                 "name": view.name,
             }
         )
-    size = moments[0][0].camera.width
-    index = {"frames": list(range(len(moments))), "tile": [rows, columns], "tile_size": size, "views": views}
+    size = views_by_frame[0][0].camera.width
+    index = {"frames": list(range(len(views_by_frame))), "tile": [rows, columns], "tile_size": size, "views": views}
     write_zip(path, [(BANK_JSON, json.dumps(index, indent=1).encode()), *sheets])
 
 

@@ -164,7 +164,7 @@ def _pieces(reader: GlbReader, shown: Sequence[tuple[int, int]], globals_: Matri
 
 
 def _has_no_scale(node: dict[str, Any], matrix: NDArray[np.float64]) -> bool:
-    """Tell if a scale of 0 hides a mesh, as where frames are shown in turn; skinned ones follow their joints alone."""
+    """Return whether a scale of 0 hides a mesh, as where frames are shown in turn; skinned ones follow joints alone."""
     return "skin" not in node and not matrix[:3, :3].any()
 
 

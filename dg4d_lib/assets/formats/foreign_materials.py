@@ -96,7 +96,7 @@ class BaseColors:
 
 
 def is_transparent(tree: dict[str, Any], primitive: dict[str, Any]) -> bool:
-    """Tell if the material of a primitive hides all of it: its alpha is below the cutoff, or 0 where it is blended."""
+    """Return whether the material of a primitive hides all of it: alpha below the cutoff, or 0 where it is blended."""
     material = _material(tree, primitive)
     factor = _base_color(material).get("baseColorFactor", (1, 1, 1, 1))
     match material.get("alphaMode", "OPAQUE"):

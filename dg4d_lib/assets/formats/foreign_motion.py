@@ -235,7 +235,7 @@ def _place(document: GltfDocument, placement: NDArray[np.float64]) -> None:
 
 
 def _follows_joints_alone(tree: dict[str, Any], node: int) -> bool:
-    """Tell if the place of a node has no effect: all it shows is skinned, and nothing hangs on it."""
+    """Return whether the place of a node has no effect: all it shows is skinned, and nothing hangs on it."""
     item = tree["nodes"][node]
     if "mesh" not in item or item.get("children") or any(node in skin["joints"] for skin in tree.get("skins", ())):
         return False

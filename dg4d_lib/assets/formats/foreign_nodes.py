@@ -142,7 +142,7 @@ def skin_weights(reader: GlbReader, attributes: dict[str, int]) -> tuple[NDArray
 
 
 def flattening(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which matrices flatten what they move; small ones need not, as of quantized meshes."""
+    """Return which matrices flatten what they move; small ones need not, as of quantized meshes."""
     linear = matrices[:, :3, :3]
     flat: NDArray[np.bool_] = np.abs(np.linalg.det(linear)) <= FLAT * np.linalg.norm(linear, axis=(1, 2)) ** 3
     return flat

@@ -188,7 +188,7 @@ def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int
 
 
 def _by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -> Float[np.ndarray, "v k"]:
-    """Return the weights of all joints, so many, at every vertex."""
+    """Return the weights of every vertex for all `count` joints."""
     columns = np.array([movers[joint] for joint in skinned.joints])
     dense = np.zeros((len(skinned.indices), count))
     np.add.at(dense, (np.arange(len(dense))[:, None], columns[skinned.indices]), skinned.weights)

@@ -20,7 +20,7 @@ from torch import Tensor
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.formats.gltf import GltfDocument
 from dg4d_lib.errors import BadInput
-from dg4d_lib.images import resize_planes
+from dg4d_lib.images import resize_planes, to_bytes
 
 TEXTURE_TRANSFORM = "KHR_texture_transform"
 WEBP = "EXT_texture_webp"
@@ -117,8 +117,8 @@ class Atlas:
 
 def to_uint8(texture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Convert colors in [0, 1] to uint8."""
-    parts = texture.detach().split(ROWS)
-    return torch.cat([part.cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8) for part in parts]).numpy()
+    parts = texture.split(ROWS)
+    return torch.cat([to_bytes(part) for part in parts]).numpy()
 
 
 def encode_image(pixels: UInt8[np.ndarray, "h w 3"], kind: str, quality: int) -> bytes:

@@ -120,7 +120,7 @@ def _no_mesh(stage: Usd.Stage) -> str:
 
 
 def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:
-    """Tell if a prim is visible and neither a proxy of another one nor a guide."""
+    """Return whether a prim is visible and neither a proxy of another one nor a guide."""
     visible = prim.ComputeVisibility(time) != UsdGeom.Tokens.invisible
     return visible and prim.ComputePurpose() not in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)
 

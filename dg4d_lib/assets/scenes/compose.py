@@ -366,7 +366,7 @@ def _retime(
 
 
 def _apart(times: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which keys to keep so that all are more than `SHORTEST_S` apart.
+    """Return which keys to keep so that all are more than `SHORTEST_S` apart.
 
     Of two keys at one time, as the end of a loop and the start of the next, the second is kept; of all, the first and
     the last, which the asset shows before its start and after its end.

@@ -74,7 +74,7 @@ def enlarged_masks(alpha: Float[Tensor, "t h w"], size: int) -> Bool[Tensor, "t 
 
 
 def surroundings(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a mask and so many pixels around it; none if it is empty."""
+    """Return the rows and columns of the bounding box of a mask with a margin; none if it is empty."""
     rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
     if len(rows) == 0:
         return slice(0, 0), slice(0, 0)

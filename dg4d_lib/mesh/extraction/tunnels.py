@@ -133,7 +133,7 @@ def euler_gain(solid, labels, samples):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _is_new(solid, labels, part, i, j, k, a, b, c):
-    """Tell whether the corner, edge, face or cube of a sample towards (a, b, c) is of no solid or earlier sample."""
+    """Return whether the corner, edge, face or cube of a sample towards (a, b, c) is of no solid or earlier sample."""
     for x in range(min(a, 0), max(a, 0) + 1):
         for y in range(min(b, 0), max(b, 0) + 1):
             for z in range(min(c, 0), max(c, 0) + 1):

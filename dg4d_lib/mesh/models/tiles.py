@@ -100,7 +100,7 @@ def _window(local: Float[np.ndarray, "f 3 2"]) -> tuple[Int[np.ndarray, " 2"], I
 
 
 def _shown(part: ModelPart) -> Bool[np.ndarray, " f"]:
-    """Tell which triangles may show an opaque texel: one in the box around their texture coordinates."""
+    """Return which triangles may show an opaque texel: one in the box around their texture coordinates."""
     if part.texture is None or not part.masked:
         return np.ones(len(part.faces), bool)
     local = local_uvs(part)

@@ -354,7 +354,7 @@ def _fitted(
 def _regular(
     line: Float64[np.ndarray, "k 2"], other: Float64[np.ndarray, "k 2"], root: Float64[np.ndarray, "1 2"]
 ) -> bool:
-    """Tell whether a line has the length of another one, about, and no sharp bend."""
+    """Return whether a line has the length of another one, about, and no sharp bend."""
     steps, others = (np.diff(np.concatenate([root, points]), axis=0) for points in (line, other))
     lengths = np.linalg.norm(steps, axis=1)
     share = lengths.sum() / max(float(np.linalg.norm(others, axis=1).sum()), 1e-9)
