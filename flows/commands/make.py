@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.errors import BadInput
 from flows.commands import terminal
 from flows.convert import convert_job, stored
 from flows.engine.output_lock import is_up_to_date
@@ -15,10 +15,11 @@ from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.publish import check_folder
-from flows.step_errors import StepError
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from flows.packages.delivery import Outcome
 
 
 @dataclass(frozen=True)
@@ -66,18 +67,20 @@ def make_each(wish: Wish, console: "Console") -> int:
     if wish.alone:
         raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
     items = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in wish.pictures])
-    failed: dict[str, DG4DError | StepError] = {}
+    failed: dict[str, Outcome] = {}
     for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
         console.print(f"{number} of {len(items)}: {picture}", markup=False)
         try:
             _make(wish, item, picture, (wish.out or Path("out")) / item, console)
-        except (DG4DError, StepError) as error:
-            failed[item] = error
-            console.print(f"failed: {item}: {_message(error)}", markup=False, style="red")
+        except Exception as error:  # must not stop the other pictures
+            from flows.engine.item_runs import failure
+
+            failed[item] = failure(error)
+            console.print(f"failed: {item}: {failed[item].message}", markup=False, style="red")
     console.print(f"{len(items) - len(failed)} of {len(items)} assets are in {wish.out or Path('out')}", markup=False)
     if not failed:
         return 0
-    return exit_status_of(type(failed[item]).__name__ if item in failed else "" for item in items)
+    return exit_status_of(failed[item].kind if item in failed else "" for item in items)
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
@@ -100,7 +103,3 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
     terminal.print_next(console, folder)
     if failing := failing_gates(folder):
         console.print(f"not accepted: {', '.join(failing)}; the report says what to do", markup=False, style="yellow")
-
-
-def _message(error: DG4DError | StepError) -> str:
-    return error.message if isinstance(error, StepError) else str(error)

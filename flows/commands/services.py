@@ -3,6 +3,8 @@
 import os
 import shlex
 import time
+from contextlib import suppress
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -194,13 +196,14 @@ def watch(
 ) -> None:
     """Convert the files that are dropped into a folder.
 
-    Uses the deployment "Catalog to 4D" of `dg4d up`, and runs until it is stopped.
+    Uses the deployment "Catalog to 4D" of `dg4d up`, and runs until it is stopped. A manifest directly in the folder
+    names what is converted; without one, that is every picture and video. When the command is started again, it sends
+    the folder once more: finished items are skipped, failed ones are tried again.
     """
     with exit_on_error():
+        from dg4d_lib.errors import BadInput
         from flows.convert import connect
         from flows.packages.publish import check_writable
-        from flows.serving import background
-        from steps.contract import digest_of
 
         check_writable(out)
         connect()
@@ -208,31 +211,42 @@ def watch(
 
         from flows.serving.results import Results
         from flows.serving.roots import granted
-        from flows.serving.watching import Watcher, announce, check_registered
+        from flows.serving.watching import FailedRuns, Watcher, announce, check_registered
         from flows.ui.showing import revive
 
         check_registered()
-        name = digest_of([str(folder.resolve()), str(out.resolve())]).removeprefix("sha256:")[:16]
-        watcher = Watcher(folder, out, rest_s, background.background_server().folder / f"watched-{name}")
+        watcher = Watcher(folder, out, rest_s)
         typer.echo(f"watching {watcher.folder}; packages go to {watcher.out}; stop with Ctrl-C")
-        results = Results(watcher.out)
+        results, runs = Results(watcher.out), FailedRuns(watcher.out)
+        looked, trouble = 0.0, ""
         with granted(watcher.folder, watcher.out):
-            looked, away = 0.0, False
             while True:
-                if time.monotonic() - looked >= RESULTS_EVERY_S:
-                    for line in results.look():
+                now = time.monotonic()
+                if now - looked >= RESULTS_EVERY_S:
+                    looked, lines = now, results.look()
+                    with suppress(httpx.HTTPError):  # the next look asks again
+                        lines += runs.look()
+                    for line in lines:
                         typer.echo(line)
-                    looked = time.monotonic()
-                if (digest := watcher.look(time.monotonic())) is not None:
+                if (digest := watcher.look(now)) is not None:
+                    before, trouble = trouble, ""
                     try:
-                        announce(watcher.folder, watcher.out, digest)
-                    except httpx.TransportError:
-                        if not away:
-                            typer.echo("the server does not answer; the files are announced when it does", err=True)
-                        away = True
+                        announce(watcher.folder, watcher.inputs(), watcher.out, digest)
+                    except BadInput as error:  # the user can change the folder
+                        trouble = str(error)
+                    except (httpx.TransportError, httpx.HTTPStatusError) as error:
+                        if isinstance(error, httpx.HTTPStatusError) and not _is_passing(error.response.status_code):
+                            raise
+                        trouble = "the server does not answer; the files are announced when it does"
                         revive()
                     else:
-                        away = False
-                        watcher.told(digest)
+                        watcher.told()
                         typer.echo(f"files came to rest; sent to the server: {digest}")
+                    if trouble not in {"", before}:
+                        typer.echo(trouble, err=True)
                 time.sleep(POLL_S)
+
+
+def _is_passing(status: int) -> bool:
+    """Return True for an HTTP status of a server that may accept the same request later."""
+    return status == HTTPStatus.TOO_MANY_REQUESTS or status >= HTTPStatus.INTERNAL_SERVER_ERROR

@@ -243,11 +243,10 @@ class BatchTable:
         self._took[item] = time.monotonic() - self._since.get(item, time.monotonic())
 
     def show(self, row: "Row", out: Console) -> None:
-        """Record the result of an item, and print it where there is no terminal; the summary has errors."""
+        """Record the result of an item, and print it where there is no terminal."""
         self.settle(row.item, row.status, row.message)
         if not out.is_terminal:
-            message = "" if row.status == "failed" else row.message
-            out.print(f"{row.item}: {row.status} {message}".rstrip(), markup=False)
+            out.print(f"{row.item}: {row.status} {row.message}".rstrip(), markup=False)
 
     def __rich__(self) -> Table:
         """Return the table; in long batches only running items and the latest failures."""

@@ -99,12 +99,12 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
                 behind = ahead or _holder(folder, resource, devices)
                 waiting(f"waiting for {_WORDS[resource]}" + (f", behind {behind}" if behind else ""))
             stopping.wait(POLL_S)
-    os.truncate(handle, 0)
-    os.write(handle, turn.holder.encode(errors="replace"))
     token = _held.set(Slot(device if resource == "gpu" else "", handle))
     try:
+        _name_holder(handle, turn.holder)
         yield time.monotonic() - start
     finally:
+        _name_holder(handle, "")
         _held.reset(token)
         os.close(handle)
 
@@ -175,6 +175,13 @@ def _free(folder: Path, resource: Resource, devices: tuple[str, ...]) -> tuple[i
 def _lock_file(folder: Path, resource: Resource, device: str) -> Path:
     name = "".join(letter if letter.isalnum() else "-" for letter in device)
     return folder / f"{resource}-{name}.lock"
+
+
+def _name_holder(handle: int, holder: str) -> None:
+    """Write the name of a slot's holder into its file, for those who wait; without room it stays unknown."""
+    with suppress(OSError):
+        os.truncate(handle, 0)
+        os.pwrite(handle, holder.encode(errors="replace"), 0)
 
 
 def _holder(folder: Path, resource: Resource, devices: tuple[str, ...]) -> str:

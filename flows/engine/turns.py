@@ -31,14 +31,16 @@ def ticket(folder: Path, begun_ns: int, holder: str) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=folder, suffix=".new")
     os.close(handle)
+    new = Path(name)
     own = folder / f"{begun_ns:020d}-{time.time_ns():020d}-{os.getpid()}-{next(_numbers)}.ticket"
-    with locked(Path(name)):
-        Path(name).write_text(holder, encoding="utf-8", errors="replace")
-        Path(name).rename(own)  # visible to others only when it is locked
-        try:
+    try:
+        with locked(new):
+            new.write_text(holder, encoding="utf-8", errors="replace")
+            new.rename(own)  # visible to others only when it is locked
             yield own
-        finally:
-            own.unlink(missing_ok=True)
+    finally:
+        new.unlink(missing_ok=True)
+        own.unlink(missing_ok=True)
 
 
 def first_ahead(own: Path) -> str | None:

@@ -120,12 +120,18 @@ def _media(folder: Path, paths: Iterable[Path], out: Path) -> list[Found]:
     found = []
     for path in sorted(set(paths)):
         name = path.relative_to(folder)
-        if path.suffix.lower() not in SUFFIXES or not path.is_file() or any(part[0] == "." for part in name.parts):
+        linked = path.is_symlink() and path.is_dir()  # nobody follows it: without an error its files would be missed
+        is_media = path.suffix.lower() in SUFFIXES and path.is_file()
+        if not (linked or is_media) or any(part[0] == "." for part in name.parts):
             continue
         if own & {*path.parents, *path.absolute().parents} or any(is_package(folder / up) for up in name.parents):
             continue
+        if linked and (own & {path.absolute(), path.resolve()} or is_package(path)):
+            continue
         try:
-            found.append(Found(name.as_posix(), sources.resolve_inside(folder, name.as_posix(), "the file")))
+            place = sources.resolve_inside(folder, name.as_posix(), "the folder" if linked else "the file")
         except BadInput as error:
             found.append(Found(name.as_posix(), path, error=str(error)))
+        else:
+            found += [] if linked else [Found(name.as_posix(), place)]  # one that leads inside is listed there
     return found

@@ -5,6 +5,7 @@ from typing import Any
 
 from flows.inputs.json_text import loads
 from steps.artifacts.archives import can_exist, stays_inside
+from steps.store.files import require_regular
 
 RECORD = "provenance.json"
 FORMAT = 2  # of the record
@@ -17,6 +18,7 @@ def record_of(folder: Path) -> dict[str, Any] | None:
     a file, or it is nested too deeply.
     """
     try:
+        require_regular(folder / RECORD)
         record = loads((folder / RECORD).read_text(encoding="utf-8"))
         names = [*record["files"], *record.get("beside", ())]
         sound = isinstance(record["files"], dict) and all(stays_inside(name) and can_exist(name) for name in names)

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, Literal
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.inputs.signing_key import CERTIFICATE, KEY, certificate_digest, read_pem
 from flows.packages.publish import Files, file_digest
+from steps.store.files import require_regular
 
 EMBEDDED = {".mp4": "video/mp4", ".png": "image/png", ".webp": "image/webp"}  # formats with embedded credentials
 BESIDE = (".glb", ".usdz")  # embedded credentials would break the 64-byte alignment of USDZ entries
@@ -208,6 +209,8 @@ def check_signature(path: Path, sidecar: Path | None = None, anchors: str = "") 
         OSError: a file cannot be read.
     """
     library = _library()
+    for read in filter(None, (path, sidecar)):
+        require_regular(read)
     media_type = EMBEDDED[path.suffix] if sidecar is None else ANY_BYTES
     manifest = None if sidecar is None else sidecar.read_bytes()
     try:

@@ -7,22 +7,27 @@ import hashlib
 import itertools
 import os
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from dg4d_lib.errors import BadInput, listed
 from flows.inputs.naming import check_folder_name
 from flows.inputs.package_record import RECORD, record_of
+from flows.processes import host_id
 from steps.artifacts.archives import unpack
-from steps.store.files import remove_tree, room_for
+from steps.store.files import remove_tree, require_regular, room_for, walk
 
+HOST_DIGITS = 6  # of the machine in names of scratch folders, see `naming.LONGEST_PART_BYTES`
+FOREIGN_S = 24 * 3600.0  # without a change, after which a scratch folder of another machine is left over
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}
 Finish = Callable[[Path, Files], Files]
 Say = Callable[[str], None]
+Scratch = Literal["incoming", "outgoing"]  # folder: of a new package, of an earlier one
 
 
 def check_folder(folder: Path, item: str = "", force: bool = False) -> None:
@@ -62,13 +67,15 @@ def check_writable(folder: Path) -> None:
     """
     place = folder.absolute()
     try:
+        folder.resolve()
         while not place.exists():
             place = place.parent
         with room_for(place):
             tempfile.TemporaryDirectory(prefix=".dg4d-", dir=place).cleanup()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
+        reason = error.strerror if isinstance(error, OSError) else error
         raise BadInput(
-            f"the output folder {folder} cannot be written: {error.strerror} ({place}); choose another with -o"
+            f"the output folder {folder} cannot be written: {reason} ({place}); choose another with -o"
         ) from error
 
 
@@ -145,11 +152,14 @@ def leftovers(folder: Path) -> list[Path]:
     """List what commands that were killed while they published left beside a folder, or in it."""
     folder, left = folder.resolve(), []
     for path in sorted(p for place in (folder.parent, folder) for p in place.glob(f".{glob.escape(folder.name)}.*-*")):
-        kind, _, pid = path.name.removeprefix(f".{folder.name}.").partition("-")
-        # in containers, process ids are used again
-        gone = pid.isdigit() and (int(pid) == os.getpid() or not Path(f"/proc/{pid}").exists())
-        left += [path] if gone and kind in {"incoming", "outgoing"} else []
+        kind, _, owner = path.name.removeprefix(f".{folder.name}.").partition("-")
+        left += [path] if kind in get_args(Scratch) and _has_ended(owner, path) else []
     return left
+
+
+def scratch_name(folder: Path, kind: Scratch, pid: int) -> str:
+    """Return the name of a folder beside, or in, an output folder that a process of this machine publishes to."""
+    return f".{folder.name}.{kind}-{_host()}-{pid}"
 
 
 def recover(folder: Path, say: Say = lambda _: None) -> None:
@@ -179,7 +189,8 @@ def unpacked(package: Path, folder: Path) -> Files:
 
 
 def file_digest(path: Path) -> dict[str, Any]:
-    """Return digest and size of a file."""
+    """Return digest and size of a file; raise OSError if it cannot be read, or is a FIFO or a device."""
+    require_regular(path)
     with path.open("rb") as file:
         return {
             "digest": f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}",
@@ -198,8 +209,8 @@ def _publish(package: Path, folder: Path, finish: Finish, say: Say, in_place: bo
     place = folder if in_place else folder.parent
     place.mkdir(parents=True, exist_ok=True)
     recover(folder, say)
-    staging = place / f".{folder.name}.incoming-{os.getpid()}"
-    before = staging.with_name(f".{folder.name}.outgoing-{os.getpid()}")
+    staging = place / scratch_name(folder, "incoming", os.getpid())
+    before = place / scratch_name(folder, "outgoing", os.getpid())
     remove_tree(staging)
     try:
         staging.mkdir()
@@ -214,6 +225,30 @@ def _publish(package: Path, folder: Path, finish: Finish, say: Say, in_place: bo
         return files
     finally:
         remove_tree(staging)
+
+
+def _host() -> str:
+    """Return a short digest of the identity of this machine: process ids of others say nothing here."""
+    return hashlib.sha256(host_id().encode()).hexdigest()[:HOST_DIGITS]
+
+
+def _has_ended(owner: str, scratch: Path) -> bool:
+    """Return true if the process that made a scratch folder, "HOST-PID", has ended; those of others end with time."""
+    host, _, pid = owner.partition("-")
+    if host != _host():
+        return time.time() - _last_change(scratch) > FOREIGN_S
+    # in containers, process ids are used again
+    return pid.isdigit() and (int(pid) == os.getpid() or not Path(f"/proc/{pid}").exists())
+
+
+def _last_change(folder: Path) -> float:
+    """Return when something in a folder was changed last, in seconds since the epoch; 0 if it is gone."""
+    last = 0.0
+    for path in (folder, *walk(folder)):
+        with suppress(FileNotFoundError):
+            status = path.lstat()
+            last = max(last, status.st_mtime, status.st_ctime)  # a rename changes the latter only
+    return last
 
 
 def _is_complete(record: dict[str, Any]) -> bool:

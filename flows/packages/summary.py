@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -18,7 +19,7 @@ from flows.formatting.numbers import format_duration
 from flows.inputs.package_record import record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.html_pages import render
-from steps.store.files import write_atomically
+from steps.store.files import DiskFull, write_atomically
 
 Status = Literal["done", "unchanged", "failed", "skipped"]
 NOT_ACCEPTED = "NotAccepted"  # kind of failure of a finished item that fails a gate in a strict batch
@@ -132,10 +133,14 @@ class Writer:
         self._next = 0.0
 
     def write_sometimes(self, rows: list[Row], seconds: float) -> None:
-        """Call `write` unless that was a moment ago; writing takes a small share of a batch's time."""
+        """Call `write` unless that was a moment ago; writing takes a small share of a batch's time.
+
+        A write that fails, as in a network folder that is away for a moment, leaves the earlier summary.
+        """
         start = time.monotonic()
         if start >= self._next:
-            self.write(rows, seconds)
+            with suppress(OSError, DiskFull):
+                self.write(rows, seconds)
             took = time.monotonic() - start
             self._next = start + max(WRITE_EVERY_S, took / WRITING_SHARE)
 

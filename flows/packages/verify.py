@@ -14,6 +14,7 @@ from flows.packages.crate import CRATE, crate_digest, files_in, render_crate
 from flows.packages.credentials import check_signature, sidecar_name
 from flows.packages.publish import file_digest
 from steps.contract import RUN_ONLY, Frozen, digest_of
+from steps.store.files import require_regular
 
 State = Literal["whole", "altered", "missing", "extra", "trusted", "untrusted", "invalid", "unsigned", "unchecked"]
 FAULTS = frozenset(["altered", "missing", "invalid", "unsigned"])
@@ -131,6 +132,7 @@ def _file(folder: Path, name: str, fact: Mapping[str, Any]) -> Check:
 def _crate(path: Path) -> tuple[dict[str, dict[str, Any]], Check]:
     """Return digest and size of the files that the crate lists, and its own check."""
     try:
+        require_regular(path)
         text = path.read_text(encoding="utf-8")
         document = loads(text)
         whole = text == render_crate(document) and document["@graph"][0]["sha256"] == crate_digest(document)

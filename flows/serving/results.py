@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.formatting.escaping import visible
+from steps.store.files import require_regular
 
 RECORD = "provenance.json"  # of a package
 REPORT = "report.json"
@@ -70,6 +71,7 @@ def visible_files(folder: Path) -> Iterator[Path]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
+        require_regular(path)
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}

@@ -13,11 +13,11 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, BinaryIO, ClassVar, NamedTuple
 
-from dg4d_lib.errors import BackendUnavailable, DG4DError
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from steps.contract import ArtifactRef, is_digest
 from steps.store.files import room_for, walk, write_atomically
 
@@ -75,13 +75,14 @@ class ArtifactStore:
 
         Raises:
             DiskFull: there is no room; the store is as it was.
+            BadInput: the store is that of another user.
         """
         with path.open("rb") as source:
-            return self._keep(source, media_type)
+            return self._put(source, media_type)
 
     def put_bytes(self, content: bytes, media_type: str) -> ArtifactRef:
         """Store some bytes; raises as `put` does."""
-        return self._keep(io.BytesIO(content), media_type)
+        return self._put(io.BytesIO(content), media_type)
 
     def get(self, ref: ArtifactRef, path: Path) -> None:
         """Write an artifact to `path`, as a file that may be changed without harm to the store.
@@ -90,7 +91,7 @@ class ArtifactStore:
             ArtifactMissing: it is not here, or its bytes do not match its digest (then it is dropped).
             DiskFull: there is no room at `path`.
         """
-        with room_for(path.parent), self._file(ref).open("rb") as source, path.open("wb") as target:
+        with room_for(path.parent), self._opened(ref) as source, path.open("wb") as target:
             digest, _ = copy_hashed(source, target)
         if digest != ref.digest:
             path.unlink()
@@ -168,7 +169,8 @@ class ArtifactStore:
         Raises:
             DiskFull: there is no room; the old content stays.
         """
-        write_atomically(self._new_file(name), text)
+        with self._allowed():
+            write_atomically(self._new_file(name), text)
 
     def create(self, name: str, text: str) -> bool:
         """Write a small file unless one of this name exists; return True for the one caller that wrote it.
@@ -176,7 +178,8 @@ class ArtifactStore:
         Raises:
             DiskFull: there is no room; no file is left.
         """
-        path = self._new_file(name)
+        with self._allowed():
+            path = self._new_file(name)
         with room_for(path.parent):
             try:
                 file = path.open("x", encoding="utf-8")
@@ -212,9 +215,8 @@ class ArtifactStore:
         """Return True if the file of an artifact matches its digest."""
         place = self._place(ref.digest)
         try:
-            with place.open("rb") as file:
-                status = os.fstat(file.fileno())
-                version = status.st_ino, status.st_mtime_ns, status.st_size
+            with self._allowed(), place.open("rb") as file:
+                version = _version(os.fstat(file.fileno()))
                 if self._verified.get(place) != version:
                     if _digest(file) != ref.digest:
                         return False
@@ -229,6 +231,23 @@ class ArtifactStore:
             raise self._missing(ref)
         return self._place(ref.digest)
 
+    def _opened(self, ref: ArtifactRef) -> BinaryIO:
+        with self._allowed():
+            return self._file(ref).open("rb")
+
+    @contextmanager
+    def _allowed(self) -> Iterator[None]:
+        """Turn a refused access in the block into BadInput, which names the owner of the file or folder."""
+        try:
+            yield
+        except PermissionError as error:
+            path = Path(error.filename2 or error.filename or self.root)
+            raise BadInput(
+                f"{path}, in the store {self.root}, belongs to {_owner(path)}, and this user may not use it: a folder "
+                "is the store of one user; set $DG4D_STORE to a folder of your own, or for several users to "
+                "s3://BUCKET/PREFIX"
+            ) from error
+
     def _missing(self, ref: ArtifactRef) -> ArtifactMissing:
         return ArtifactMissing(
             f"artifact {ref.digest} ({ref.media_type}) is not in {self.address}: run the same command again to renew it"
@@ -241,10 +260,30 @@ class ArtifactStore:
             f"artifact {ref.digest} ({ref.media_type}) was damaged: run the same command again to renew it"
         )
 
+    def _put(self, source: BinaryIO, media_type: str) -> ArtifactRef:
+        """Store a stream from its beginning; of one that is here and sound, only the time is renewed."""
+        digest, size = copy_hashed(source)
+        ref = ArtifactRef(digest=digest, media_type=media_type, size_bytes=size)
+        if self._renewed(ref):
+            return ref
+        source.seek(0)
+        return self._keep(source, media_type)
+
+    def _renewed(self, ref: ArtifactRef) -> bool:
+        """Return True if the artifact is here and sound; garbage collection then counts its age from now on."""
+        place = self._place(ref.digest)
+        with suppress(FileNotFoundError, PermissionError):  # it was removed meanwhile, or cannot be renewed
+            if self._is_right(ref):
+                os.utime(place)
+                self._verified[place] = _version(place.stat())
+                return True
+        return False
+
     def _keep(self, source: BinaryIO, media_type: str) -> ArtifactRef:
         """Copy a stream into the store; an existing file is replaced, for it may be damaged."""
         with (
             room_for(self.root),
+            self._allowed(),
             tempfile.NamedTemporaryFile(dir=self._new_file(f"{INCOMING}/new").parent, delete=False) as target,
         ):
             scratch = Path(target.name)
@@ -285,10 +324,29 @@ def _digest(file: io.BufferedReader) -> str:
     return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
-def copy_hashed(source: BinaryIO, target: IO[bytes]) -> tuple[str, int]:
-    """Copy a stream to its end; return the digest and the number of bytes."""
+def _version(status: os.stat_result) -> tuple[int, int, int]:
+    """Return what changes when a file does: inode, time and size."""
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _owner(path: Path) -> str:
+    """Return the name of the user that a path, or the nearest folder above it that can be seen, belongs to."""
+    for place in (path, *path.parents):
+        try:
+            return f"the user {place.owner()}"
+        except KeyError:
+            return f"the user {place.stat().st_uid}"
+        except OSError:
+            continue
+    return "another user"
+
+
+def copy_hashed(source: BinaryIO, target: IO[bytes] | None = None) -> tuple[str, int]:
+    """Read a stream to its end, and copy it to `target`; return the digest and the number of bytes."""
     content, size = hashlib.sha256(), 0
     while chunk := source.read(CHUNK):
         content.update(chunk)
-        size += target.write(chunk)
+        size += len(chunk)
+        if target is not None:
+            target.write(chunk)
     return f"sha256:{content.hexdigest()}", size

@@ -146,12 +146,12 @@ class BucketStore(ArtifactStore):
         super().tidy(unused_s)
         remove_unused(self.root / OBJECTS, unused_s)
 
-    def _keep(self, source: BinaryIO, media_type: str) -> ArtifactRef:
+    def _put(self, source: BinaryIO, media_type: str) -> ArtifactRef:
         """Copy to this machine, which yields the digest, then to the bucket in one upload.
 
         An equal object is uploaded again if it is older than `RENEW_S`, as garbage collection goes by the age.
         """
-        ref = super()._keep(source, media_type)
+        ref = super()._put(source, media_type)
         modified = self._modified(ref)
         if modified is None or time.time() - modified > RENEW_S:
             with self._writing():
@@ -179,7 +179,7 @@ class BucketStore(ArtifactStore):
         """Copy an artifact from the bucket to this machine; a damaged one is dropped from the bucket."""
         try:
             with self._answering():
-                copy = super()._keep(self._reader(ref.digest), ref.media_type)
+                copy = self._keep(self._reader(ref.digest), ref.media_type)
         except FileNotFoundError as error:
             raise self._missing(ref) from error
         if copy.digest != ref.digest:

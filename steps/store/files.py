@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -78,6 +79,16 @@ def walk(folder: Path) -> Iterator[Path]:
     """Yield everything below a folder; what others remove meanwhile is left out, which `Path.rglob` does not do."""
     for place, folders, names in os.walk(folder):
         yield from (Path(place, name) for name in (*folders, *names))
+
+
+def require_regular(path: Path) -> None:
+    """Refuse everything but a regular file: reading a FIFO or a device may never end.
+
+    Raises:
+        OSError: there is no such file, or it is a folder, a FIFO, a socket or a device.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
 def remove_tree(folder: Path) -> None:

@@ -4,9 +4,11 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from dg4d_lib.errors import BadInput
 from steps.contract import ArtifactRef
 from steps.store import artifact_store as module
 from steps.store.artifact_store import ArtifactMissing, ArtifactStore
@@ -41,6 +43,43 @@ def test_equal_content_is_kept_once(store: ArtifactStore) -> None:
     store.put_bytes(b"same", "a/b")
     store.put_bytes(b"same", "c/d")
     assert len(files_in(store)) == 1
+
+
+def test_equal_content_is_not_written_again_and_young_again(store: ArtifactStore, tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"same")
+    kept = store.path(store.put(tmp_path / "a", "a/b"))
+    before = kept.stat()
+    os.utime(kept, (1, 1))
+    ref = store.put(tmp_path / "a", "a/b")
+    assert kept.stat().st_ino == before.st_ino and kept.stat().st_mtime >= before.st_mtime - 1
+    assert store.is_sound(ref)
+    kept.chmod(0o600)
+    kept.write_bytes(b"bent")  # of the same size
+    os.utime(kept, (1, 1))
+    assert store.put(tmp_path / "a", "a/b") == ref and kept.read_bytes() == b"same"
+
+
+def test_the_store_of_another_user_is_refused(
+    store: ArtifactStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ref = store.put_bytes(b"precious", "a/b")
+    real = Path.open
+
+    def closed(path: Path, mode: str = "r", **options: Any) -> Any:
+        if path.is_relative_to(store.root):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return real(path, mode, **options)
+
+    monkeypatch.setattr(Path, "open", closed)
+    monkeypatch.setattr(Path, "owner", lambda _: "ana")
+    for use in (
+        lambda: store.path(ref),
+        lambda: store.get(ref, tmp_path / "b"),
+        lambda: store.put_bytes(b"precious", "a/b"),
+        lambda: store.write("records/a", "1"),
+    ):
+        with pytest.raises(BadInput, match=r"store .* belongs to the user ana.*one user; set \$DG4D_STORE"):
+            use()
 
 
 def test_changing_a_fetched_file_leaves_the_store_as_it_was(store: ArtifactStore, tmp_path: Path) -> None:

@@ -36,6 +36,23 @@ def test_structural_similarity_counts_when_it_has_a_weight():
     assert rendering.color.grad is not None and rendering.color.grad.abs().sum() > 0
 
 
+@pytest.mark.parametrize(
+    ("reference", "guidance", "advice"),
+    [
+        (1.0, torch.nan, "set prior.precision=bf16 or fp32"),
+        (1.0, torch.inf, "set prior.precision=bf16 or fp32"),
+        (torch.nan, torch.nan, "lower the learning rates"),
+        (torch.nan, 1.0, "lower the learning rates"),
+    ],
+)
+def test_the_advice_is_for_what_diverged(reference, guidance, advice):
+    losses = {name: torch.tensor(value) for name, value in (("reference", reference), ("guidance", guidance))}
+    losses["loss"] = losses["reference"] + losses["guidance"]
+    cloud = blob(9, 0.5, torch.Generator().manual_seed(0))
+    with pytest.raises(FitDiverged, match=f"; .*{advice}"):
+        check_finite("fit", losses, [torch.zeros(3)], "iteration 1 of 2", "lower the learning rates", cloud)
+
+
 @pytest.mark.parametrize("broken", [torch.inf, torch.nan])
 def test_a_gradient_that_is_no_number_stops_the_fit(broken):
     cloud = blob(9, 0.5, torch.Generator().manual_seed(0))

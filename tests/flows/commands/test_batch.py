@@ -1,6 +1,7 @@
 """A whole batch: its order, what is tried again, what it writes, how it ends; a function stands in for all steps."""
 
 import csv
+import errno
 import json
 import os
 import signal
@@ -35,6 +36,7 @@ from flows.serving.server import Server
 from flows.step_errors import StepBadInput, StepCrashed, StepOutOfMemory
 from flows.ui.gallery import ROWS_SHOWN
 from steps.profiles import PREVIEW
+from steps.store.files import DiskFull
 
 QUIET = Console(quiet=True)
 SIGTERM = (signal.SIGTERM, 143)
@@ -395,6 +397,23 @@ def test_a_summary_has_times_and_costs_by_item_and_in_total(tmp_path: Path) -> N
     assert lines[2]["message"] == 'a "bad", thing'
     Writer(tmp_path).write(rows, 1.0)
     assert json.loads((tmp_path / "summary.json").read_text())["totals"]["cost"] is None
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ESTALE, "Stale file handle"), DiskFull("the disk is full")])
+def test_a_summary_that_cannot_be_written_for_a_moment_ends_no_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    writer, rows = Writer(tmp_path), [Row(item="a", status="done")]
+    with monkeypatch.context() as away:
+        away.setattr("flows.packages.summary.write_atomically", fail)
+        writer.write_sometimes(rows, 1.0)
+        with pytest.raises(type(error)):
+            writer.write(rows, 1.0)
+    writer.write(rows, 1.0)
+    assert (tmp_path / "summary.json").is_file()
 
 
 def test_a_batch_of_thousands_is_summed_up_now_and_then_and_its_page_loads_what_is_seen(

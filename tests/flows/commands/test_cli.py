@@ -11,6 +11,7 @@ from fake_steps import PNG, bank_json, picture
 from typer.testing import CliRunner, Result
 
 from flows import cli
+from steps.artifacts import rendering
 from steps.store import artifact_store as store_module
 
 
@@ -44,6 +45,18 @@ def refused(result: Result, says: str, status: int = 65) -> None:
 
 def test_a_missing_file() -> None:
     refused(dg4d("make", "dog.png", "-o", "out"), "dog.png does not exist")
+
+
+@pytest.mark.parametrize(("options", "cropped", "says"), [([], 3, "edge: 3; --fit"), ([], 0, ""), (["--fit"], 3, "")])
+def test_cropped_renders_are_told(monkeypatch: pytest.MonkeyPatch, options: list[str], cropped: int, says: str) -> None:
+    def render_package(*_: object, fit: bool) -> rendering.Renders:
+        assert fit == ("--fit" in options)
+        return rendering.Renders([Path("out/view_0")], cropped)
+
+    monkeypatch.setattr(rendering, "render_package", render_package)
+    result = dg4d("render", ".", "-o", "out", *options)
+    assert result.stdout == "out/view_0\n"
+    assert says in result.stderr if says else not result.stderr
 
 
 def test_a_folder_instead_of_a_file() -> None:

@@ -13,9 +13,11 @@ from PIL import Image
 from rich.console import Console
 
 from flows import convert
+from flows.commands import make
 from flows.commands.terminal import print_next, print_tables, steps_shown
 from flows.engine.events import StepEvent, emit
 from flows.engine.schedule import Schedule
+from flows.packages import publish
 from flows.packages.scores import ObjectScores, Results, remarks, titled_tables
 from flows.serving.results import Results as WatchedResults
 
@@ -35,6 +37,18 @@ def test_several_pictures_become_an_asset_each_and_a_bad_one_does_not_stop_the_o
     ran(log)
     again = dg4d("make", "a.png", "c.png", "-o", "all")
     assert again.exit_code == 0 and again.stdout.count("nothing to do") == 2 and ran(log) == []
+
+
+def test_an_unexpected_error_of_a_picture_does_not_stop_the_others(dg4d: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def check_folder(folder: Path, item: str, force: bool) -> None:
+        if item == "b":
+            raise RuntimeError("nobody thought of this")
+        publish.check_folder(folder, item, force)
+
+    monkeypatch.setattr(make, "check_folder", check_folder)
+    done = dg4d("make", *(words(f"{name}.png", name) for name in "abc"), "-o", "all")
+    assert done.exit_code == 1 and "failed: b: RuntimeError: nobody thought of this" in done.stdout
+    assert "2 of 3 assets are in all" in done.stdout
 
 
 def test_pictures_of_one_name_get_folders_of_their_own(dg4d: Run) -> None:

@@ -5,11 +5,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from uuid import uuid4
 
 import httpx
 import pytest
 import typer
+from prefect.client.schemas.objects import FlowRun
 from prefect.settings import PREFECT_API_URL
+from prefect.states import Failed
 from waiting import wait_until
 
 from dg4d_lib.errors import BadInput
@@ -162,27 +165,97 @@ def test_a_command_uses_the_server_that_it_connected_to(tmp_path: Path, monkeypa
     assert not background.background_server().is_used()
 
 
-def test_a_watch_goes_on_while_the_server_is_away(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def inbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A watched folder with a picture, whose server is a stand-in."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "fox.png").write_bytes(b"picture")
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     monkeypatch.setattr(services, "POLL_S", 0.0)
     monkeypatch.setattr(convert, "connect", lambda: None)
     monkeypatch.setattr(watching, "check_registered", lambda: None)
-    happened: list[str] = []
+    monkeypatch.setattr(watching.FailedRuns, "_failed", lambda _: [])
+    return tmp_path / "in"
 
-    def announce(folder: Path, out: Path, digest: str) -> None:
+
+def answer(status: int) -> httpx.HTTPStatusError:
+    request = httpx.Request("POST", "http://127.0.0.1/api/events")
+    return httpx.HTTPStatusError("refused", request=request, response=httpx.Response(status, request=request))
+
+
+def test_a_watch_goes_on_while_the_server_is_away(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    happened: list[str] = []
+    troubles = [httpx.ConnectError("away"), answer(500), answer(429)]
+
+    def announce(folder: Path, inputs: Path, out: Path, digest: str) -> None:
         happened.append(digest)
-        if len(happened) < 5:
-            raise httpx.ConnectError("away")
+        if troubles:
+            raise troubles.pop(0)
 
     monkeypatch.setattr(watching, "announce", announce)
     monkeypatch.setattr(showing, "revive", lambda: happened.append("revived"))
     monkeypatch.setattr(watching.Watcher, "told", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(typer.Exit):
-        services.watch(tmp_path / "in", tmp_path / "out", 0.0)
+        services.watch(inbox, inbox.parent / "out", 0.0)
     digest = happened[0]
-    assert happened == [digest, "revived", digest, "revived", digest]
+    assert happened == [digest, "revived", digest, "revived", digest, "revived", digest]
     assert capsys.readouterr().err.count("the server does not answer") == 1
+
+
+def test_a_watch_ends_when_the_server_refuses_its_events(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(watching, "announce", lambda *_: (_ for _ in ()).throw(answer(403)))
+    with pytest.raises(typer.Exit):
+        services.watch(inbox, inbox.parent / "out", 0.0)
+    assert "does not answer" not in capsys.readouterr().err
+
+
+def test_a_watch_announces_a_manifest_and_waits_while_there_are_several(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    announced: list[Path] = []
+    for name in ("a.csv", "b.csv"):
+        (inbox / name).write_text("path\nfox.png\n")
+    looks = iter(range(100))
+
+    def sleep(_: float) -> None:
+        if next(looks) == 2:
+            (inbox / "b.csv").unlink()
+
+    def announce(folder: Path, inputs: Path, out: Path, digest: str) -> None:
+        announced.append(inputs)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(watching, "announce", announce)
+    monkeypatch.setattr(services.time, "sleep", sleep)
+    with pytest.raises(typer.Exit):
+        services.watch(inbox, inbox.parent / "out", 0.0)
+    assert announced == [inbox / "a.csv"]
+    assert capsys.readouterr().err.count("several manifests (a.csv, b.csv)") == 1
+
+
+def test_a_watch_prints_failed_runs(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(name: str) -> FlowRun:
+        state = Failed(message=f"{name} went wrong")
+        return FlowRun(flow_id=uuid4(), name=name, state=state, parameters={"out": str(inbox.parent / "out")})
+
+    found, looks = [run("earlier")], iter(range(100))
+
+    def sleep(_: float) -> None:
+        found[:0] = [run(f"run {next(looks)}")]
+        if len(found) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(watching, "announce", lambda *_: None)
+    monkeypatch.setattr(watching.FailedRuns, "_failed", lambda _: list(found))
+    monkeypatch.setattr(services, "RESULTS_EVERY_S", 0.0)
+    monkeypatch.setattr(services.time, "sleep", sleep)
+    with pytest.raises(typer.Exit):
+        services.watch(inbox, inbox.parent / "out", 0.0)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("failed")] == ["failed: run run 0: run 0 went wrong"]

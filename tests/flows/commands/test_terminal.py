@@ -51,12 +51,15 @@ def test_what_the_library_has_to_say_is_shown():
         assert "compiling kernels" in screen.getvalue()
 
 
-def test_the_error_of_an_item_of_a_batch_is_printed_once(tmp_path: Path) -> None:
+def test_the_error_of_an_item_of_a_batch_is_printed_when_it_happens_and_at_the_end(tmp_path: Path) -> None:
     screen = io.StringIO()
     out, row = Console(file=screen, soft_wrap=True), Row(item="fox", status="failed", message="row 1: no subject")
     BatchTable(["fox"]).show(row, out)
     print_summary([row], tmp_path, out)
-    assert screen.getvalue().splitlines()[:2] == ["fox: failed", "failed: fox: row 1: no subject"]
+    assert screen.getvalue().splitlines()[:2] == [
+        "fox: failed row 1: no subject",
+        "failed: fox: row 1: no subject",
+    ]
 
 
 def test_rows_stand_in_columns_and_words_in_brackets_stay():

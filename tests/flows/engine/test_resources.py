@@ -1,5 +1,7 @@
 """What steps share: a GPU has one step at a time, whoever asks; the processor's turns go on meanwhile."""
 
+import errno
+import os
 import subprocess
 import sys
 import threading
@@ -231,5 +233,29 @@ def test_who_waited_and_was_killed_holds_up_nobody(tmp_path: Path) -> None:
         killed.kill()
         killed.wait()
         killed.stdout.close()
+    with slot("cpu", silent) as waited_s:
+        assert waited_s < 5
+
+
+def test_a_slot_names_nobody_when_its_step_has_ended(tmp_path: Path) -> None:
+    file = tmp_path / "home" / "slots" / "cpu-0.lock"
+    with slot("cpu", silent, Turn(1, "fit_motion of a newt")):
+        assert file.read_text() == "fit_motion of a newt"
+    assert file.read_text() == ""
+
+
+def test_a_full_disk_keeps_no_slot_and_no_ticket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "pwrite", full)
+        with slot("cpu", silent):  # its name is worth no failed step
+            pass
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "write_text", full)
+        with pytest.raises(OSError, match="No space"), slot("cpu", silent):
+            pass
+    assert list((tmp_path / "home" / "slots" / "queue-cpu").iterdir()) == []
     with slot("cpu", silent) as waited_s:
         assert waited_s < 5

@@ -257,6 +257,15 @@ def test_a_link_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None
     ]
 
 
+def test_a_linked_folder_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path) -> None:
+    touch(tmp_path, "outside/b.png", "in/a.png", "in/deep/c.png", "out/d.png")
+    for name, target in (("elsewhere", "outside"), ("inside", "in/deep"), (".hidden", "outside"), ("own", "out")):
+        (tmp_path / "in" / name).symlink_to(tmp_path / target)
+    found = items(tmp_path / "in", str(tmp_path / "out"))
+    assert [(item.name, bool(item.error)) for item in found] == [("a", False), ("deep/c", False), ("elsewhere", True)]
+    assert "the folder 'elsewhere' leads out of the folder" in found[-1].error and "copy" in found[-1].error
+
+
 def test_a_pattern_gives_what_it_matches_named_from_its_first_plain_folder(tmp_path: Path) -> None:
     touch(tmp_path, "in/a.png", "in/deep/b.png", "in/deep/c.jpg", "in/.d.png", "in/out/e.png", "f.png")
     found = items(f"{tmp_path}/in/**/*.png", f"{tmp_path}/in/out")

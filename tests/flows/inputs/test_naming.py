@@ -1,6 +1,7 @@
 import time
 import unicodedata
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -14,6 +15,7 @@ from flows.inputs.naming import (
     name_from_path,
     unique_names,
 )
+from flows.packages.publish import Scratch, scratch_name
 
 
 @pytest.mark.parametrize("letter", ["a", "é", "猫", "🦎"])
@@ -26,7 +28,8 @@ def test_bytes_count_and_not_letters(letter: str) -> None:
 
 def test_every_name_that_is_allowed_leaves_room_for_the_names_of_scratch_folders(tmp_path: Path) -> None:
     longest = "n" * LONGEST_PART_BYTES
-    for name in (f".{longest}.incoming-4194304", f".{longest}.outgoing-4194304", f"{longest}-motions"):
+    incoming, outgoing = (scratch_name(Path(longest), kind, 4194304) for kind in get_args(Scratch))
+    for name in (incoming, outgoing, f"{longest}-motions"):
         (tmp_path / name).mkdir()
 
 

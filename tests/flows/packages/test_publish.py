@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import time
 import zipfile
 from pathlib import Path
 
@@ -8,8 +9,16 @@ import pytest
 
 from dg4d_lib.errors import BadInput
 from flows.engine.output_lock import is_up_to_date
-from flows.inputs.package_record import record_of
-from flows.packages.publish import Files, check_folder, is_current, publish
+from flows.inputs.package_record import RECORD, record_of
+from flows.packages.publish import (
+    Files,
+    check_folder,
+    is_current,
+    leftovers,
+    load_verified,
+    publish,
+    scratch_name,
+)
 from flows.packages.verify import verify
 from steps.store.files import DiskFull
 
@@ -171,8 +180,8 @@ def test_what_a_killed_command_left_is_cleared_up_or_put_back(package: Path, tmp
     publish(package, out, finish)
     (out / "notes.txt").write_text("mine")
     dead = 2**22 + 1  # above the largest number a process can have
-    out.rename(tmp_path / f".out.outgoing-{dead}")  # killed between the two renames
-    (tmp_path / f".out.incoming-{dead}").mkdir()
+    out.rename(tmp_path / scratch_name(out, "outgoing", dead))  # killed between the two renames
+    (tmp_path / scratch_name(out, "incoming", dead)).mkdir()
     publish(package, out, finish)
     assert tree(out)["notes.txt"] == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "package.zip"]
@@ -185,10 +194,10 @@ def test_a_package_that_is_up_to_date_gets_back_the_users_files_that_a_killed_co
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / "home"))
     out, dead = tmp_path / "out", 2**22 + 1
     publish(package, out, finish)
-    left = tmp_path / place / f".out.outgoing-{dead}"
+    left = tmp_path / place / scratch_name(out, "outgoing", dead)
     publish(package, left, finish)
     (left / "notes.txt").write_text("mine")
-    (tmp_path / place / f".out.incoming-{dead}").mkdir()
+    (tmp_path / place / scratch_name(out, "incoming", dead)).mkdir()
     assert not is_up_to_date(out, "o2") and left.exists()
     assert is_up_to_date(out, "o1") and is_up_to_date(out, "o1")
     assert tree(out)["notes.txt"] == "mine"
@@ -198,11 +207,44 @@ def test_a_package_that_is_up_to_date_gets_back_the_users_files_that_a_killed_co
 def test_what_a_killed_process_of_the_same_number_left_does_not_block(package: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     publish(package, out, finish)
-    left = tmp_path / f".out.outgoing-{os.getpid()}"  # as in a container, whose commands have one number
+    left = tmp_path / scratch_name(out, "outgoing", os.getpid())  # as in a container, whose commands have one number
     left.mkdir()
     (left / "notes.txt").write_text("mine")
     publish(package, out, finish)
     assert tree(out)["notes.txt"] == "mine" and not left.exists()
+
+
+def test_what_another_machine_writes_stays_until_it_has_not_changed_for_a_day(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, dead = tmp_path / "out", 2**22 + 1
+    monkeypatch.setenv("DG4D_HOST_ID", "another")
+    foreign = tmp_path / scratch_name(out, "incoming", dead)
+    monkeypatch.setenv("DG4D_HOST_ID", "this")
+    (foreign / "meshes").mkdir(parents=True)
+    assert scratch_name(out, "incoming", dead) != foreign.name
+    publish(package, out, finish)
+    assert foreign.is_dir() and leftovers(out) == []
+    later = time.time() + 25 * 3600
+    monkeypatch.setattr("flows.packages.publish.time.time", lambda: later)
+    (foreign / "meshes" / "000.glb").touch()
+    os.utime(foreign / "meshes" / "000.glb", (later, later))
+    assert leftovers(out) == []
+    (foreign / "meshes" / "000.glb").unlink()
+    publish(package, out, finish)
+    assert not foreign.exists()
+
+
+def test_a_pipe_is_no_package_and_has_no_digest(package: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    publish(package, out, finish)
+    (out / "asset.glb").unlink()
+    os.mkfifo(out / "asset.glb")
+    with pytest.raises(BadInput, match=r"asset.glb cannot be read \(not a regular file\)"):
+        load_verified(out)
+    (out / RECORD).unlink()
+    os.mkfifo(out / RECORD)
+    assert record_of(out) is None
 
 
 def test_an_entry_outside_the_package_is_refused(tmp_path: Path) -> None:
@@ -218,6 +260,13 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.doc").write_text("years of work")
     with pytest.raises(BadInput, match=r"thesis\.doc"):
         check_folder(tmp_path)
+
+
+def test_a_circle_of_links_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "circle").symlink_to("circle")
+    for folder in (tmp_path / "circle", tmp_path / "circle" / "out"):
+        with pytest.raises(BadInput, match=r"cannot be written: .*loop"):
+            check_folder(folder)
 
 
 def test_a_file_or_a_place_under_a_file_is_refused(tmp_path: Path) -> None:

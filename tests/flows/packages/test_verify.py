@@ -1,4 +1,5 @@
 import json
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -84,6 +85,13 @@ def test_a_link_is_no_file_of_a_package(package: Path) -> None:
     (package.parent / "elsewhere").write_bytes(content)
     (package / "asset.glb").symlink_to(package.parent / "elsewhere")
     assert faults(verify(package)) == {"asset.glb": "altered"}
+
+
+@pytest.mark.parametrize("name", ["asset.glb", CRATE])
+def test_a_pipe_in_place_of_a_file_is_a_fault(package: Path, name: str) -> None:
+    (package / name).unlink()
+    os.mkfifo(package / name)
+    assert faults(verify(package)) == {name: "altered"}
 
 
 def with_new_crate(package: Path, change: Callable[[dict[str, Any]], None]) -> None:

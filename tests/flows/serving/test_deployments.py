@@ -16,7 +16,7 @@ from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterParentFlowRunId
 from prefect.exceptions import PrefectHTTPStatusError, TerminationSignal
 from prefect.flow_engine import run_flow
-from prefect.states import Cancelling, Pending
+from prefect.states import Cancelling, Failed, Pending
 from pydantic import ValidationError
 from tiny_s3 import TinyS3
 from waiting import wait_until
@@ -217,15 +217,26 @@ def test_a_folder_is_not_watched_on_a_server_that_would_lose_its_files(
     assert done.exit_code == 69 and "run `dg4d up` first" in done.stderr
 
 
+def test_the_failed_runs_of_a_watched_folder_are_known(client: SyncPrefectClient, tmp_path: Path) -> None:
+    catalog = client.read_deployment_by_name(watching.DEPLOYMENT)
+    runs = watching.FailedRuns(tmp_path / "out")
+    for out, message in (("out", "no items"), ("elsewhere", "another")):
+        given = {"inputs": "in", "out": str(tmp_path / out)}
+        client.create_flow_run_from_deployment(catalog.id, name="in", parameters=given, state=Failed(message=message))
+    assert runs.look() == ["failed: run in: no items"]
+    assert runs.look() == watching.FailedRuns(tmp_path / "out").look() == []
+
+
 @pytest.mark.slow
 def test_what_is_dropped_into_a_folder_is_converted_by_a_worker(
     worker: tuple[TinyS3, Path], client: SyncPrefectClient, tmp_path: Path
 ) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "dropped.png").write_text(picture("dropped"))
-    announce(tmp_path / "in", tmp_path / "out", "sha256:0")
+    (tmp_path / "in" / "list.csv").write_text("path\ndropped.png\n")
+    announce(tmp_path / "in", tmp_path / "in" / "list.csv", tmp_path / "out", "sha256:0")
     run = wait_until(lambda: ended(client, str(tmp_path / "out")))
-    assert run.parameters["inputs"] == str(tmp_path / "in")
+    assert run.parameters["inputs"] == str(tmp_path / "in" / "list.csv")
     assert run.state.is_completed() and run.state.message == f"1 of 1 items are in {tmp_path / 'out'}"
     status = json.loads((tmp_path / "out" / "summary.json").read_text())["items"][0]["status"]
     assert status == "done"

@@ -180,11 +180,12 @@ def test_what_a_pattern_or_a_folder_finds_by_links_is_a_failed_row(place: Path) 
     (place / "in" / "fox.png").unlink()
     (place / "in" / "dir").symlink_to(place / "away")
     (place / "in" / "link.png").symlink_to(place / "away" / "fox.png")
-    for inputs in (f"{place}/in/*.png", f"{place}/in/*/*.png", f"{place}/in"):
-        state = deployments.catalog_to_4d.fn(inputs, str(place / "in" / "out"))
+    for inputs, names in (("in/*.png", ["link"]), ("in/*/*.png", ["dir/fox"]), ("in", ["dir", "link"])):
+        state = deployments.catalog_to_4d.fn(f"{place}/{inputs}", str(place / "in" / "out"))
         assert state.is_failed()
-        (row,) = json.loads((place / "in" / "out" / "summary.json").read_text())["items"]
-        assert row["status"] == "failed" and "leads out of the folder" in row["message"]
+        rows = json.loads((place / "in" / "out" / "summary.json").read_text())["items"]
+        assert [row["item"] for row in rows] == names
+        assert all(row["status"] == "failed" and "leads out of the folder" in row["message"] for row in rows)
     assert stored() == []
 
 
@@ -387,6 +388,7 @@ def test_what_a_killed_watcher_granted_ends_with_it(place: Path) -> None:
 def test_the_command_grants_what_it_watches(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for asks_a_server in ("flows.convert.connect", "flows.serving.watching.check_registered"):
         monkeypatch.setattr(asks_a_server, lambda: None)
+    monkeypatch.setattr("flows.serving.watching.FailedRuns._failed", lambda _: [])
     seen: list[Roots] = []
 
     def look(*_: object) -> None:
