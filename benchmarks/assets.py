@@ -32,7 +32,7 @@ from dg4d_lib.assets.formats.rigged import fit_asset_rig, write_rigged_glb
 from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats, write_spz_frames
 from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
-from dg4d_lib.assets.rendering.preview import write_preview, write_turntable
+from dg4d_lib.assets.rendering.preview import shown_points, write_preview, write_turntable
 from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.deformation.factory import new_deformation
@@ -151,7 +151,7 @@ def _glb(asset: Asset4D, settings: GltfSettings, folder: Path) -> None:
 def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> Iterator[tuple[str, Write]]:
     cloud, field = splats.gaussians, splats.deformation
     states = pose_gaussians(cloud, field, FRAMES, torch.arange(float(FRAMES)))
-    rasterizer = get_rasterizer("auto")
+    rasterizer, motion = get_rasterizer("auto"), (cloud, field, FRAMES, FPS)
     yield "splats, PLY", lambda folder: write_splats(folder, states)
     yield "splats, SPZ", lambda folder: write_spz_frames(folder, states)
     yield "splats, glTF", lambda folder: write_splat_glb_frames(folder, states)
@@ -161,12 +161,12 @@ def splat_writers(asset: Asset4D, splats: CompactAsset, pack: PackSettings) -> I
     yield "asset.usdz, quantized", lambda folder: write_usdz(folder / "a.usdz", asset, FPS, states, half=True)
     yield (
         "preview.mp4",
-        lambda folder: write_preview(folder / "a.mp4", cloud, field, FRAMES, FPS, rasterizer, pack),
+        lambda folder: write_preview(folder / "a.mp4", *motion, rasterizer, pack, shown_points(cloud, field, FRAMES)),
     )
     yield "turntable.mp4", lambda folder: write_turntable(folder / "a.mp4", states.at(0), rasterizer, pack)
     yield (
         "preview.webp",
-        lambda folder: write_webp(folder / "a.webp", cloud, field, FRAMES, FPS, rasterizer, pack),
+        lambda folder: write_webp(folder / "a.webp", *motion, rasterizer, pack, shown_points(cloud, field, FRAMES)),
     )
 
 

@@ -1,9 +1,10 @@
-"""Antialiased resizing and alpha compositing of images."""
+"""Antialiased resizing, alpha compositing and quantization of images."""
 
 from collections.abc import Sequence
 from typing import Literal
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -44,3 +45,8 @@ def over_white(cutouts: Float[Tensor, "*b h w 4"]) -> Float[Tensor, "*b h w 3"]:
 def luminance(pictures: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """Return the luma of pictures (ITU-R BT.601)."""
     return pictures @ pictures.new_tensor((0.299, 0.587, 0.114))
+
+
+def to_bytes(values: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
+    """Return the nearest of 256 levels from 0 to 1 for every value, on the CPU and without gradients."""
+    return values.detach().cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8)

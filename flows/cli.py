@@ -357,6 +357,9 @@ def render(
         int | None, typer.Option(min=1, metavar="N", help="number of timestamps  [default: every frame]")
     ] = None,
     mesh: Annotated[bool, typer.Option("--mesh", help="render the textured mesh instead of the splats")] = False,
+    fit: Annotated[
+        bool, typer.Option("--fit", help="widen the field of view until it holds the whole asset from all sides")
+    ] = False,
 ) -> None:
     """Render an asset from given azimuths as RGBA pictures."""
     with exit_on_error():
@@ -372,8 +375,11 @@ def render(
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from steps.artifacts.rendering import render_package
 
-        for folder in render_package(package, angles, elevation, size, frames, mesh, out):
+        views, cropped = render_package(package, angles, elevation, size, frames, mesh, out, fit=fit)
+        for folder in views:
             typer.echo(folder)
+        if cropped and not fit:
+            typer.echo(f"pictures in which the asset touches the edge: {cropped}; --fit shows all of it", err=True)
 
 
 @app.command()

@@ -2,8 +2,10 @@
 
 import time
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 from prefect import flow, runtime
+from pydantic import WithJsonSchema
 
 from flows import home
 from flows.engine.publishing import keep_version, publish
@@ -16,9 +18,12 @@ from flows.tasks import TASKS, drive_video, prepare_subject
 from flows.ui.asset_page import show_asset
 from steps.contract import ArtifactRef
 
+# Prefect would build the whole schema, 70 kB, once per flow (0.05 s each); no form shows it, for none is deployed
+Job: TypeAlias = Annotated[ConversionJob, WithJsonSchema({"type": "object"})]
+
 
 @flow(name="image_to_4d", flow_run_name="{job.item}", persist_result=False)
-def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+def image_to_4d(job: Job, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Turn a picture into an animated 3D asset; a video keeps its motion.
 
     Args:
@@ -33,7 +38,7 @@ def image_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
 
 
 @flow(name="video_to_4d", flow_run_name="{job.item}", persist_result=False)
-def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+def video_to_4d(job: Job, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Turn a video into an animated 3D asset that moves as the video does.
 
     Raises:
@@ -43,7 +48,7 @@ def video_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int 
 
 
 @flow(name="text_to_4d", flow_run_name="{job.item}", persist_result=False)
-def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
+def text_to_4d(job: Job, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
     """Draw a picture from words and turn it into an animated 3D asset.
 
     Raises:
@@ -53,7 +58,7 @@ def text_to_4d(job: ConversionJob, folder: Path | None = None, mesh_parts: int =
 
 
 @flow(name="motions", flow_run_name="{job.item}", persist_result=False)
-def motions(job: ConversionJob) -> dict[str, ArtifactRef]:
+def motions(job: Job) -> dict[str, ArtifactRef]:
     """Generate and rank candidate motions of a picture; return the outputs of `drive_video`.
 
     Raises:

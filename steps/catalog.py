@@ -147,7 +147,7 @@ STEPS: dict[str, StepSpec] = {
             outputs={"gaussians": PLY, "first_look": WEB_SPLATS, "curves": CURVES, "picture": PNG},
             sections=("rasterizer", "subject.turn_deg", "prior", "static"),
             resource="gpu",
-            late_imports=("dg4d_lib.rasterizer.cpu", "torch._dynamo"),  # torch's optimizers import the latter
+            late_imports=("dg4d_lib.rasterizer.cpu",),
         ),
         _step(
             "fit_motion",

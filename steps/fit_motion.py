@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import torch
 
+from dg4d_lib.deformation.factory import AnyDeformation, deformation_of_subset
 from dg4d_lib.fitting.motion import fit_motion
+from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.ply import read_ply, write_ply
+from dg4d_lib.gaussians.strays import find_strays
 from dg4d_lib.rasterizer.interface import get_rasterizer, preferred_device
 from dg4d_lib.settings import DeformationSettings, MotionSettings
 from steps.artifacts.media import read_frames, write_png
@@ -15,6 +18,7 @@ from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_d
 from steps.fitting.tracking import TRACKED_NOTE, SurfaceTracker, most_iterations, tracks_surface
 from steps.runtime.job import Job, StepReport
 
+STRAYS = "Gaussians that tore away from the moving subject and were dropped: {}."
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
 FRONT_DEG, SIDE_DEG = 0.0, 90.0
@@ -58,8 +62,8 @@ def run(job: Job) -> StepReport:
             start, deformation, video, chosen.prior, rasterize, settings, generator, watch, known=others
         )
     deformation.cpu()
-    gaussians = fitted.to(torch.device("cpu"))
-    if settings.fine_tune:
+    gaussians, deformation, strays = _without_strays(fitted.to(torch.device("cpu")), deformation, len(video))
+    if settings.fine_tune or strays:
         write_ply(job.outputs["gaussians"], gaussians)
     write_motion(job.outputs["motion"], deformation, kind, len(video), len(gaussians))
     curves.write(job.outputs["curves"], "motion fit", [chosen.note])
@@ -69,5 +73,17 @@ def run(job: Job) -> StepReport:
     rows = [render_row(states, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
     write_png(job.outputs["picture"], torch.cat(rows))
     report = chosen.report(f"{backend} rasterizer")
-    report = replace(report, notes=(*report.notes, TRACKED_NOTE)) if tracked else report
-    return replace(report, notes=(*report.notes, FINE_TUNED)) if settings.fine_tune else report
+    told = ((tracked, TRACKED_NOTE), (strays, STRAYS.format(strays)), (settings.fine_tune, FINE_TUNED))
+    return replace(report, notes=(*report.notes, *(note for happened, note in told if happened)))
+
+
+def _without_strays(
+    gaussians: Gaussians, deformation: AnyDeformation, frames: int
+) -> tuple[Gaussians, AnyDeformation, int]:
+    """Drop Gaussians that tear away from the subject; return the others, their deformation, and the number dropped."""
+    with torch.no_grad():
+        states = deformation.displace(gaussians.means, torch.linspace(0, 1, frames)).apply(gaussians)
+    kept = ~find_strays(states)
+    if kept.all():
+        return gaussians, deformation, 0
+    return gaussians.subset(kept), deformation_of_subset(deformation, kept), int((~kept).sum())

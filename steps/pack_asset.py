@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import Asset4D, pose_gaussians
@@ -24,7 +26,7 @@ from dg4d_lib.assets.formats.spz import scale_notes
 from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.placement import Placement, Surface, place
-from dg4d_lib.assets.rendering.preview import write_mp4, write_preview, write_turntable
+from dg4d_lib.assets.rendering.preview import shown_points, write_mp4, write_preview, write_turntable
 from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
 from dg4d_lib.assets.resample import (
@@ -33,6 +35,7 @@ from dg4d_lib.assets.resample import (
     resample_asset,
     resampled_positions,
 )
+from dg4d_lib.cameras.viewpoints import whole_fov_y_deg
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -186,11 +189,16 @@ class PackageWriter:
 
     def write_preview(self) -> Sequence[str]:
         """Write the film of the motion, as splats and as a lit mesh, with a camera that goes round."""
-        return write_preview(self.path(packages.PREVIEW), *self._motion, mesh_at=self._mesh_at_frame)
+        return write_preview(self.path(packages.PREVIEW), *self._motion, self.points, self._mesh_at_frame)
 
     def write_moving_picture(self) -> None:
         """Write the same as a small animated WebP for web pages."""
-        write_webp(self.path(packages.MOVING_PICTURE), *self._motion)
+        write_webp(self.path(packages.MOVING_PICTURE), *self._motion, self.points)
+
+    @cached_property
+    def points(self) -> Float[Tensor, "t p 3"]:
+        """Points that the pictures of the motion hold, as they were fitted."""
+        return shown_points(self.fit.gaussians, self.fit.deformation, self.fit.frames)
 
     @property
     def _motion(self) -> tuple[Gaussians, Deformation, int, float, Rasterizer, PackSettings]:
@@ -207,7 +215,7 @@ class PackageWriter:
         """Write the contact sheet."""
         fit = self.fit
         sheet = draw_contact_sheet(
-            fit.gaussians, fit.deformation, self.video, self.rasterizer, self.pack, self._mesh_at_frame
+            fit.gaussians, fit.deformation, self.video, self.rasterizer, self.pack, self.points, self._mesh_at_frame
         )
         write_png(self.path(packages.SHEET), sheet)
 
@@ -262,7 +270,7 @@ def run(job: Job) -> StepReport:
             vertices=tuple(len(mesh.vertices) for mesh in package.meshes),
             triangles=tuple(len(mesh.faces) for mesh in package.meshes),
             placement=PackagePlacement(scale=package.placement.scale, translation=package.placement.translation),
-            camera=Camera.placed(package.placement),
+            camera=Camera.placed(package.placement, whole_fov_y_deg(package.points)),
             ply_axes="y_down",
             files={name: packages.about(name) for name in names},
             notes=(*package.notes, *notes),

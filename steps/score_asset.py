@@ -169,7 +169,7 @@ def _score_package(
     size, total = given.color.shape[1], len(truth.views) + 2
 
     def render(azimuth_deg: float, frames: int | None) -> ViewFrames:
-        (view,) = render_package(
+        (view,), _ = render_package(
             package, (azimuth_deg,), 0.0, size, frames, settings.mesh, scratch / "ours", rasterizer=settings.rasterizer
         )
         rendered = _read(sorted(view.iterdir()))

@@ -4,11 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS, OrbitCamera
 
 BAKING_ELEVATIONS_DEG = (0.0, -45.0, 45.0)
 PLASTIC = 1.324717957244746  # real root of x^3 = x + 1
@@ -83,10 +84,35 @@ def widened(cameras: Sequence[OrbitCamera], points: Float[Tensor, "t p 3"]) -> l
     for camera in cameras[:: -(-len(cameras) // PROBES)] if points.numel() else ():
         view = camera.viewmat().to(points.device)
         seen = points.double() @ view[:3, :3].T + view[:3, 3]
-        tangents = seen[..., :2].abs().amax(-1) / seen[..., 2].clamp_min(NEAREST)
-        widest = max(widest, float(tangents.quantile(SHOWN, 1).max()) * (1 + MARGIN))
-    fov_y_deg = math.degrees(2 * math.atan(widest))
+        widest = max(widest, _shown_tangent(seen[..., :2].abs().amax(-1) / seen[..., 2].clamp_min(NEAREST)))
+    fov_y_deg = _fov_deg(widest)
     return [replace(camera, fov_y_deg=max(fov_y_deg, camera.fov_y_deg)) for camera in cameras]
+
+
+def whole_fov_y_deg(points: Float[Tensor, "t p 3"]) -> float:
+    """Return the field of view of square pictures that show nearly all points, from all sides at the usual distance.
+
+    It is at least that of the input camera. As in `widened`, a few strays among the points of a frame are not shown.
+
+    Args:
+        points: at every frame, world units.
+    """
+    if not points.numel():
+        return FOV_Y_DEG
+    reach = points.double().norm(dim=-1)
+    # over all cameras, a point is farthest from the middle of the picture where the line of sight touches its sphere
+    tangents = reach / (RADIUS**2 - reach.square()).clamp_min(NEAREST**2).sqrt()
+    return max(FOV_Y_DEG, _fov_deg(_shown_tangent(tangents)))
+
+
+def _shown_tangent(tangents: Float[Tensor, "t p"]) -> float:
+    """Return the tangent of half a field of view that holds nearly all points of every frame, and a margin."""
+    of_frames = np.quantile(tangents.cpu().numpy(), SHOWN, axis=1)  # torch.quantile sorts, which is slower
+    return float(of_frames.max()) * (1 + MARGIN)
+
+
+def _fov_deg(tangent: float) -> float:
+    return math.degrees(2 * math.atan(tangent))
 
 
 def baking_views(size: int) -> list[OrbitCamera]:

@@ -1,10 +1,10 @@
-"""Factory of deformation models: from settings, or from a state dict."""
+"""Factory of deformation models: from settings, from a state dict, or for fewer Gaussians."""
 
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane
@@ -64,6 +64,22 @@ def from_state_dict(
     if not own:
         return deformation
     return OnParts(deformation, **{name: value for name, value in tensors.items() if not name.startswith(FIELD)})
+
+
+def deformation_of_subset(deformation: AnyDeformation, kept: Bool[Tensor, " n"]) -> AnyDeformation:
+    """Return the deformation of some of the Gaussians of a deformation."""
+    if not isinstance(deformation, OnParts):
+        return _field_of_subset(deformation, kept)
+    owners, rest, field = deformation.owners[kept], deformation.rest[kept], _field_of_subset(deformation.field, kept)
+    return OnParts(field, owners, rest, deformation.centers, deformation.quats, deformation.places)
+
+
+def _field_of_subset(field: AnyField, kept: Bool[Tensor, " n"]) -> AnyField:
+    if not isinstance(field, Framewise):
+        return field  # a function of the place
+    fewer = Framewise(len(field.table), int(kept.sum()))
+    fewer.table = nn.Parameter(field.table.detach()[:, kept], field.table.requires_grad)
+    return fewer
 
 
 def last_time(settings: DeformationSettings, frames: int) -> float:

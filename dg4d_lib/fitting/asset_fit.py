@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, pyramid_residuals, resize_cutouts
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
@@ -28,6 +28,7 @@ from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import BLUR, Rasterizer, Rendering
 from dg4d_lib.video.driving import DrivingVideo
+from dg4d_lib.video.optical_flow import optical_flow
 
 ADVICE = "lower asset.lr"
 FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
@@ -77,9 +78,7 @@ class AssetFit:
         means, quats = motion.points(self.plain.means, self.graph)[0], motion.rotations(self.graph)[0]
         names = ("harmonics", "opacity_logits", "log_scales")
         values = {name: getattr(self.plain, name).clone().requires_grad_() for name in names}
-        optimizer = torch.optim.Adam(
-            [{"params": [values[name]], "lr": lr} for name, lr in zip(names, MATCH_LR, strict=True)]
-        )
+        optimizer = Adam({"params": values[name], "lr": lr} for name, lr in zip(names, MATCH_LR, strict=True))
         for step in range(MATCH_ITERATIONS):
             state = replace(self.plain, means=means, quats=quat_multiply(quats, self.plain.quats), **values)
             drawn = self.rasterize(antialiased(state, self.camera), [self.camera], means.new_tensor(WHITE))
@@ -206,8 +205,8 @@ class AssetFit:
         alpha = drawn.alpha[0, row, column, 0]
         surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
         visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
-        pair = [luminance(self.colors[number]).cpu().numpy() for number in (frame - 1, frame)]
-        flow = torch.from_numpy(np.stack(optical_flow_tvl1(*pair), -1)).to(means)  # rows, columns
+        earlier, later = (luminance(self.colors[number]).cpu().numpy() for number in (frame - 1, frame))
+        flow = torch.from_numpy(optical_flow(earlier, later)).permute(1, 2, 0).to(means)  # rows, columns
         moved = pixels[visible] + flow[row[visible], column[visible]].flip(-1)
         return visible, moved
 

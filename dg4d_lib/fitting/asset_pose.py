@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.asset_fit import antialiased
 from dg4d_lib.fitting.losses import WHITE, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -236,9 +237,7 @@ def _refined(
     camera = OrbitCamera(width=FINE_SIZE, height=FINE_SIZE)
     values = {name: torch.zeros(size, requires_grad=True) for name, size in (("turn", 1), ("grow", 1), ("move", 2))}
     rates = {"turn": 0.03 if turning else 0.0, "grow": 0.01, "move": 0.006}
-    adam = torch.optim.Adam(
-        [{"params": [value], "lr": rates[name]} for name, value in values.items()], betas=(0.9, 0.98)
-    )
+    adam = Adam(({"params": value, "lr": rates[name]} for name, value in values.items()), betas=(0.9, 0.98))
     area = mask.mean().clamp(min=1e-3)
     cloud = replace(cloud, opacity_logits=antialiased(start.apply(cloud), camera).opacity_logits)
     for _ in range(ITERATIONS):
@@ -252,7 +251,7 @@ def _refined(
                 for part, weight in ((color, 1.0), (alpha, 2.0))
             ]
         ).sum()
-        adam.zero_grad(set_to_none=True)
+        adam.zero_grad()
         (loss / area).backward()
         adam.step()
     with torch.no_grad():

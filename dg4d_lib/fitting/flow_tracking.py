@@ -10,25 +10,26 @@ Where a frame fits much worse than the one before, parts of the model are search
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array, csr_array, vstack
-from skimage.registration import optical_flow_tvl1
+from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn import functional
 
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.fitting.node_pose import Pose, rotation, rotation_vector
+from dg4d_lib.fitting.normal_equations import NormalEquations
 from dg4d_lib.fitting.part_search import PartSearch
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_multiply
 from dg4d_lib.images import luminance
 from dg4d_lib.mesh.models.control_graph import SHORTEST, ControlGraph, symmetric_matrix
 from dg4d_lib.rasterizer.interface import Rasterizer, Rendering
+from dg4d_lib.video.optical_flow import optical_flow
 
 STEPS = 2  # Gauss-Newton steps per round
 MATCH_STEPS = 4  # towards matched patches
@@ -48,6 +49,9 @@ LARGEST_COST = 0.3  # of a pixel, so that occluded ones do not decide
 NEIGHBORS, SPREAD = 2, 0.3  # rounds and weight of the neighbors' costs
 PULL = 0.003  # cost of the farthest places of a patch
 SHARP = 0.01  # cost above the best place from which another one is told apart
+
+# Arguments of NormalEquations.add: derivatives of residuals by the unknowns of nodes, these nodes, the residuals
+_Term: TypeAlias = tuple[Float[np.ndarray, "n k d 6"], Int[np.ndarray, "n k"], Float[np.ndarray, "n d"]]
 
 
 @dataclass(frozen=True)
@@ -161,7 +165,7 @@ class FlowTracker:
         """Return where the optical flow from the render moves the visible Gaussians."""
         drawn, pixels, visible = self._seen(pose)
         picture = luminance(self._over(drawn.color, drawn.alpha))[0].cpu().numpy()
-        flow = np.stack(optical_flow_tvl1(picture, self._lumas[frame]), -1)[..., ::-1]  # columns, rows
+        flow = np.moveaxis(optical_flow(picture, self._lumas[frame])[::-1], 0, -1)  # columns, rows
         column, row = self._cells(pixels[visible]).T
         return _Targets(visible, pixels[visible] + flow[row, column], np.ones(len(visible)))
 
@@ -240,13 +244,14 @@ class FlowTracker:
     def _solved(self, pose: Pose, targets: _Targets, expected: Pose, last: Pose) -> Pose:
         """Return the pose after a Gauss-Newton step on all losses."""
         settings, count = self._settings, len(self._nodes)
+        each = np.arange(count)[:, None]
         terms = [*self._flow_terms(pose, targets), *self._rigidity_terms(pose)]
         place = np.concatenate([expected.shifts[:, :2], last.shifts[:, 2:]], 1)  # depth is not extrapolated
         for target, weight in ((place, settings.inertia), (last.shifts, STILL * settings.inertia)):
             scale = np.sqrt(weight / count) / self._unit
             blocks = np.zeros((count, 1, 3, 6))
             blocks[..., 3:] = scale * np.eye(3)
-            terms.append((_rows(blocks, np.arange(count)[:, None], count), ((pose.shifts - target) * scale).ravel()))
+            terms.append((blocks, each, (pose.shifts - target) * scale))
         unseen = [(np.array([0.0, 0.0, 1.0]), settings.depth)]
         if self._normal is not None:
             unseen.append((self._normal, across_weight(settings, self._normal)))
@@ -254,18 +259,16 @@ class FlowTracker:
             scale = np.sqrt(UNSEEN * weight / count) / self._unit
             blocks = np.zeros((count, 1, 1, 6))
             blocks[..., 3:] = scale * direction
-            terms.append((_rows(blocks, np.arange(count)[:, None], count), pose.shifts @ direction * scale))
-        depth = np.zeros((1, count, 1, 6))
-        depth[..., 5] = scale = np.sqrt(settings.whole_depth) / count / self._unit
-        terms.append((_rows(depth, np.arange(count)[None], count), pose.shifts[:, 2:].sum(0) * scale))
-        matrix = vstack([rows for rows, _ in terms], format="csr")
-        normal = (matrix.T @ matrix).toarray()
-        normal[np.diag_indices(6 * count)] += 1e-9
-        step = cho_solve(cho_factor(normal), -(matrix.T @ np.concatenate([values for _, values in terms])))
-        step = step.reshape(count, 6)
+            terms.append((blocks, each, (pose.shifts @ direction * scale)[:, None]))
+        equations = NormalEquations(count)
+        for term in terms:
+            equations.add(*term)
+        scale = np.sqrt(settings.whole_depth) / count / self._unit
+        equations.add_sum(5, scale, pose.shifts[:, 2].sum() * scale)
+        step = equations.solve()
         return Pose(rotation(step[:, :3]) @ pose.turns, pose.shifts + step[:, 3:])
 
-    def _flow_terms(self, pose: Pose, targets: _Targets) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
+    def _flow_terms(self, pose: Pose, targets: _Targets) -> list[_Term]:
         if not len(targets.rows):
             return []
         points, arms = self._points(pose, targets.rows)
@@ -277,11 +280,10 @@ class FlowTracker:
         slope *= scale[:, None, None] / unit
         moved = np.broadcast_to(slope[:, None], (*arms.shape[:2], 2, 3))
         blocks = np.concatenate([-moved @ _cross(arms), moved], -1) * self._weights[targets.rows][..., None, None]
-        index = self._indices[targets.rows]
-        return [(_rows(blocks, index, len(self._nodes)), (error * scale[:, None]).ravel())]
+        return [(blocks, self._indices[targets.rows], error * scale[:, None])]
 
-    def _rigidity_terms(self, pose: Pose) -> list[tuple[csr_array, Float[np.ndarray, " r"]]]:
-        settings, count, edges = self._settings, len(self._nodes), len(self._edges)
+    def _rigidity_terms(self, pose: Pose) -> list[_Term]:
+        settings, edges = self._settings, len(self._edges)
         weight, log = settings.rigidity, settings.rigidity_loss == "log"
         places, eye, none = self._nodes + pose.shifts, np.eye(3), np.zeros((edges, 3, 3))
         terms = []
@@ -298,13 +300,13 @@ class FlowTracker:
                 ],
                 1,
             )
-            terms.append((_rows(blocks, np.stack([first, second], 1), count), (stretch * scale[:, None]).ravel()))
+            terms.append((blocks, np.stack([first, second], 1), stretch * scale[:, None]))
         first, second = self._edges.T
         bend = rotation_vector(pose.turns[second] @ pose.turns[first].swapaxes(1, 2))
         scale = np.sqrt(weight * settings.bending / edges / _softened(bend, log))
         unit = scale[:, None, None] * eye
         blocks = np.stack([np.concatenate([-unit, none], -1), np.concatenate([unit, none], -1)], 1)
-        terms.append((_rows(blocks, self._edges, count), (bend * scale[:, None]).ravel()))
+        terms.append((blocks, self._edges, bend * scale[:, None]))
         return terms
 
 
@@ -320,15 +322,6 @@ def _features(pictures: Float[Tensor, "t s s 3"], alphas: Float[Tensor, "t s s 1
     """Return blurred pictures of half the size."""
     both = torch.cat([pictures, ALPHA_WEIGHT * alphas], -1).movedim(-1, 1)
     return functional.avg_pool2d(functional.avg_pool2d(functional.avg_pool2d(both, 3, 1, 1), 3, 1, 1), 2)
-
-
-def _rows(blocks: Float[np.ndarray, "n k d 6"], nodes: Int[np.ndarray, "n k"], count: int) -> csr_array:
-    """Return derivatives by the six unknowns of `k` nodes per item as a sparse matrix of `n d` rows."""
-    items, _, height, _ = blocks.shape
-    row = np.arange(items * height).reshape(items, 1, height, 1)
-    column = 6 * nodes[:, :, None, None] + np.arange(6)
-    places = tuple(np.broadcast_to(one, blocks.shape).ravel() for one in (row, column))
-    return csr_array(coo_array((blocks.ravel(), places), shape=(items * height, 6 * count)))
 
 
 def _softened(values: Float[np.ndarray, "n 3"], log: bool) -> Float[np.ndarray, " n"]:

@@ -13,6 +13,7 @@ from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
+from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
 from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.fitting.static import draw_view, learning_rates
@@ -71,7 +72,7 @@ def fit_motion(
     white = torch.tensor(WHITE, device=device)
     known_frames, known_images = known_pairs(known or {}, device)
     gaussians, groups = trained(gaussians.detach(), deformation, settings)
-    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
+    adam = Adam(groups, eps=1e-15)
     rates = [float(group["lr"]) for group in adam.param_groups]
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
     for step in range(1, settings.iterations + 1):
@@ -113,7 +114,7 @@ def fit_motion(
                 loss = loss + settings.guidance_weight * guidance
         if neighbors is not None:
             loss = loss + settings.rigidity_weight * rigidity_loss(moved, *neighbors)
-        adam.zero_grad(set_to_none=True)
+        adam.zero_grad()
         loss.backward()
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
         gradients = [parameter.grad for group in adam.param_groups for parameter in group["params"]]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.devices import to_device_async
+from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.losses import WHITE, Diverged, check_finite, reference_loss, resize_cutouts
 from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -35,13 +36,13 @@ class _Cloud:
     """Gaussians under optimization, one Adam parameter group per field."""
 
     parameters: dict[str, nn.Parameter]
-    adam: torch.optim.Adam
+    adam: Adam
 
     @staticmethod
     def of(gaussians: Gaussians, rates: dict[str, float]) -> "_Cloud":
         parameters = {name: nn.Parameter(value.detach().clone()) for name, value in vars(gaussians).items()}
         groups = [{"params": [parameters[name]], "lr": rate, "name": name} for name, rate in rates.items()]
-        return _Cloud(parameters, torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True))
+        return _Cloud(parameters, Adam(groups, eps=1e-15))
 
     @property
     def gaussians(self) -> Gaussians:
@@ -147,7 +148,7 @@ def fit_gaussians(
             rendered.append((rendering.visible, size))
             guidance = prior.loss(rendering.color, rendering.alpha, views, progress, generator)
             loss = loss + settings.guidance_weight * guidance
-        cloud.adam.zero_grad(set_to_none=True)
+        cloud.adam.zero_grad()
         loss.backward()
         losses = {"loss": loss, "reference": reference, "guidance": guidance}
         gradients = [parameter.grad for parameter in cloud.parameters.values()]

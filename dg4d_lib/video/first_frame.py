@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from dg4d_lib.images import luminance
+from dg4d_lib.video.optical_flow import optical_flow
 
 BACKDROP = 1.5  # luminance outside of the subject: brighter than any, so that outlines guide the flow
-WARPS, STEPS = 5, 10  # of the flow at every level; a third of scikit-image's own and as good here
 DIFFERENCE = 0.2  # of color (mean) and alpha together, at which the trust falls to 1/e
 WINDOW = 5  # pixels of a side over which differences are averaged
 SMOOTH = 3.0  # pixels: standard deviation of the window in which the strain of the flow is taken
@@ -91,8 +90,8 @@ def match_first_frame(pictures: Sequence[Float[Tensor, "4 h w"]]) -> Iterator[Co
     yield match
     for picture in pictures[1:]:
         expected = match.warp(first)
-        flow = optical_flow_tvl1(_gray(picture), _gray(expected), num_warp=WARPS, num_iter=STEPS)
-        step = Correspondence(pixels + torch.from_numpy(np.stack(flow, -1)).float(), match.trust)
+        flow = torch.from_numpy(optical_flow(_gray(picture), _gray(expected)))
+        step = Correspondence(pixels + flow.permute(1, 2, 0), match.trust)
         places = step.warp(match.places.permute(2, 0, 1)).permute(1, 2, 0)
         moved = Correspondence(places, match.trust)
         match = Correspondence(places, _agreement(picture, moved.warp(first)))

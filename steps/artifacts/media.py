@@ -14,6 +14,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import to_bytes
 from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import add_entry, unpack
 
@@ -24,7 +25,7 @@ def write_png(path: Path, picture: Float[Tensor, "h w c"]) -> None:
     Raises:
         OSError: the file could not be written.
     """
-    pixels = (picture.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous().numpy()
+    pixels = to_bytes(picture).contiguous().numpy()
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, "uint8")
     spec.attribute("oiio:UnassociatedAlpha", 1)

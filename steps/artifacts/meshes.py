@@ -11,6 +11,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import to_bytes
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from steps.artifacts.media import read_tensors, write_zip
 
@@ -19,7 +20,7 @@ def write_tracked(path: Path, tracked: TrackedMesh) -> None:
     """Write a tracked mesh; textures are rounded to 8 bits."""
     tensors = {**_tensors(tracked.mesh), "offsets": tracked.offsets.float().cpu().contiguous()}
     if tracked.textures is not None:
-        tensors["textures"] = _rounded(tracked.textures)
+        tensors["textures"] = to_bytes(tracked.textures).contiguous()
     path.write_bytes(save(tensors, {"tracked": json.dumps({"rest": tracked.reference_frame})}))
 
 
@@ -67,14 +68,10 @@ def _tensors(mesh: TexturedMesh) -> dict[str, Tensor]:
         "vertices": mesh.vertices.detach().cpu().float(),
         "faces": mesh.faces.cpu().to(torch.int32),
         "uvs": mesh.uvs.detach().cpu().float(),
-        "texture": _rounded(mesh.texture),
+        "texture": to_bytes(mesh.texture),
     }
     return {name: value.contiguous() for name, value in tensors.items()}
 
 
 def _mesh(tensors: Mapping[str, Tensor]) -> TexturedMesh:
     return TexturedMesh(tensors["vertices"], tensors["faces"], tensors["uvs"], tensors["texture"].float() / 255)
-
-
-def _rounded(colors: Tensor) -> Tensor:
-    return (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

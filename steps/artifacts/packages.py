@@ -76,15 +76,22 @@ class Camera(Frozen):
     radius: float = RADIUS
     target: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fov_y_deg: float = FOV_Y_DEG
+    whole_fov_y_deg: float | None = Field(
+        None,
+        description="field of view of square pictures that hold the whole animation from all sides, at the distance of "
+        "the input camera; older packages have none",
+    )
     convention: str = (
         "right-handed world in meters, y up, the front looks along +z; the camera looks at `target` from a distance of "
         "`radius`; azimuth 0 is on +z, 90 on +x; positive elevation is above"
     )
 
     @classmethod
-    def placed(cls, placement: Placement) -> "Camera":
+    def placed(cls, placement: Placement, whole_fov_y_deg: float) -> "Camera":
         """Return the camera in the coordinates of the files."""
-        return cls(radius=RADIUS * placement.scale, target=placement.translation)
+        return cls(
+            radius=RADIUS * placement.scale, target=placement.translation, whole_fov_y_deg=round(whole_fov_y_deg, 1)
+        )
 
 
 class Manifest(Frozen):

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -15,20 +16,43 @@ from dg4d_lib.assets.formats.compact import read_compact
 from dg4d_lib.assets.formats.glb import read_glb, read_mesh_glb
 from dg4d_lib.assets.formats.splats import read_splats
 from dg4d_lib.assets.placement import Surface
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import write_png
-from steps.artifacts.packages import ASSET, COMPACT, MERGED, MESHES, SPLATS, Manifest, read_file, read_manifest
+from steps.artifacts.packages import (
+    ASSET,
+    COMPACT,
+    MANIFEST,
+    MERGED,
+    MESHES,
+    SPLATS,
+    Manifest,
+    read_file,
+    read_manifest,
+)
 
 BATCH = 8  # pictures per rasterizer call, bounds the memory
 SMALLEST, LARGEST = 16, 4096  # pixels of a side
+OPAQUE = 0.5  # alpha above which a pixel on the edge of a picture counts as cut off
 
 States = Callable[[Float[Tensor, " b"]], Gaussians]  # Gaussians at positions of the animation, in frames
 Renderer = Callable[[Float[Tensor, " b"], Sequence[OrbitCamera]], Float[Tensor, "b h w 4"]]
+
+
+class Renders(NamedTuple):
+    """Written pictures of a package.
+
+    Attributes:
+        views: folders, one per azimuth.
+        cropped: number of pictures in which the asset touches the edge.
+    """
+
+    views: list[Path]
+    cropped: int
 
 
 def render_package(
@@ -39,9 +63,9 @@ def render_package(
     frames: int | None,
     mesh: bool,
     out: Path,
-    progress: Callable[[int, int], None] = lambda done, total: None,
     rasterizer: str = "auto",
-) -> list[Path]:
+    fit: bool = False,
+) -> Renders:
     """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and frame.
 
     Args:
@@ -52,14 +76,12 @@ def render_package(
         frames: number of pictures, evenly spaced from the first to the last frame of the fit; None: one per frame.
         mesh: render the textured mesh instead of the splats.
         out: folder, made if necessary; pictures of the same name are replaced.
-        progress: callback (pictures done, total).
         rasterizer: name of the rasterizer for splats.
-
-    Returns:
-        Folders, one per azimuth.
+        fit: take the field of view that holds the whole asset from all sides (`whole_fov_y_deg` of the manifest)
+            instead of that of the input picture.
 
     Raises:
-        BadInput: the folder is no package or a broken one, or a number is out of range.
+        BadInput: the folder is no package, a broken one, or too old for `fit`, or a number is out of range.
         BackendUnavailable: the rasterizer cannot run here.
         OSError: a picture could not be written.
     """
@@ -71,17 +93,32 @@ def render_package(
         draw = splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
     every = torch.arange(manifest.frames, dtype=torch.float64)
     positions = every if frames is None else fitted_positions(frames, folder, manifest)
-    count = len(positions)
+    fov_y_deg = _whole_fov_y_deg(folder, manifest) if fit else FOV_Y_DEG
+    count, cropped = len(positions), 0
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
-    for number, (view, azimuth_deg) in enumerate(zip(views, azimuths_deg, strict=True)):
+    for view, azimuth_deg in zip(views, azimuths_deg, strict=True):
         view.mkdir(parents=True, exist_ok=True)
-        camera = OrbitCamera(elevation_deg, azimuth_deg, width=size, height=size)
+        camera = OrbitCamera(elevation_deg, azimuth_deg, fov_y_deg=fov_y_deg, width=size, height=size)
         for start in range(0, count, BATCH):
             part = positions[start : start + BATCH]
             for frame, picture in enumerate(draw(part, [camera] * len(part)), start):
                 write_png(view / f"{frame:03d}.png", picture)
-            progress(number * count + start + len(part), len(views) * count)
-    return views
+                cropped += _touches_edge(picture)
+    return Renders(views, cropped)
+
+
+def _whole_fov_y_deg(folder: Path, manifest: Manifest) -> float:
+    if manifest.camera.whole_fov_y_deg is None:
+        raise BadInput(
+            f"{folder} cannot be fitted into pictures: an older dg4d made it, so its {MANIFEST} has no "
+            "camera.whole_fov_y_deg; make it again, or render without --fit"
+        )
+    return manifest.camera.whole_fov_y_deg
+
+
+def _touches_edge(picture: Float[Tensor, "h w 4"]) -> bool:
+    alpha = picture[..., 3]
+    return any(bool((edge > OPAQUE).any()) for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
 
 
 def fitted_positions(count: int, folder: Path, manifest: Manifest) -> Float[Tensor, " n"]:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from dg4d_lib.assets.formats.web_splats import write_web_splats
 from dg4d_lib.assets.placement import Placement
 from dg4d_lib.assets.rendering.preview import write_mp4
 from dg4d_lib.assets.rendering.viewer_page import build_viewer_page
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
 from dg4d_lib.mesh.render import render_mesh
@@ -147,6 +148,13 @@ def test_the_input_camera_follows_a_placed_asset(placement: Placement, tried: Tr
     placed = tried(write_glb(asset), placement.gaussians(splats()), view=view, shots=shots)
     for shot in shots:
         assert psnr(over_white(placed.pictures[shot]), over_white(plain.pictures[shot])) > 40
+
+
+def test_an_asset_that_leaves_the_input_picture_is_seen_from_farther_away(tried: Try) -> None:
+    page = tried(write_glb(egg()), shots=(("mesh", 0.0),), view={"whole_fov_y_deg": 90.0})
+    camera = replace(page.camera(), radius=2 / math.tan(math.radians(FOV_Y_DEG / 2)))
+    _, coverage = render_mesh(egg().mesh, [camera], egg().offsets[:1])
+    assert overlap(page.pictures["mesh", 0.0][..., 3] > 0.5, coverage[0, ..., 0].numpy() > 0.5) > 0.98
 
 
 def test_splats_look_as_our_rasterizer_draws_them(tried: Try) -> None:

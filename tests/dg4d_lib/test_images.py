@@ -1,7 +1,7 @@
 import torch
 from PIL import Image
 
-from dg4d_lib.images import color_over_white, over_background, over_white, resize, resize_planes
+from dg4d_lib.images import color_over_white, over_background, over_white, resize, resize_planes, to_bytes
 
 
 def test_a_shrunken_image_is_the_mean_of_its_pixels_and_not_some_of_them() -> None:
@@ -32,3 +32,8 @@ def test_an_opaque_pixel_hides_the_background_and_a_clear_one_shows_it() -> None
     torch.testing.assert_close(over_white(cutout)[0, 2], torch.tensor([0.6, 0.7, 0.8]))
     assert torch.equal(over_white(cutout), color_over_white(color, alpha))
     torch.testing.assert_close(over_background(color, alpha, 1.0), over_white(cutout))
+
+
+def test_levels_are_the_nearest_of_256_and_stay_in_range() -> None:
+    values = torch.tensor([-0.2, 0.0, 0.5 / 255 + 1e-4, 0.999, 1.0, 1.1], requires_grad=True)
+    assert to_bytes(values).tolist() == [0, 0, 1, 255, 255, 255]

@@ -19,11 +19,12 @@ from dg4d_lib.fitting.rigid_parts import RigidMotion
 from dg4d_lib.gaussians.ply import read_ply
 from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.settings import FramewiseSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.known import known_view
 from steps import fit_gaussians, fit_motion
 from steps.artifacts.media import read_png, write_frames, write_png
-from steps.artifacts.motions import read_motion
+from steps.artifacts.motions import read_motion, read_states
 from steps.fit_gaussians import one_state
 from steps.fitting import tracking
 from steps.fitting.priors import read_bank
@@ -122,6 +123,30 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     before, after = read_ply(gaussians), read_ply(work.outputs["gaussians"])
     assert len(before) == len(after) and not torch.equal(before.harmonics, after.harmonics)
     assert "together with their motion" in facts.notes[-1]
+
+
+def test_gaussians_that_tear_away_are_dropped_with_their_motion(
+    tmp_path: Path, subject: Path, monkeypatch: pytest.MonkeyPatch
+):
+    gaussians = fitted(tmp_path, subject).outputs["gaussians"]
+    frames = torch.stack([disc(), disc(2), disc(4)])
+    write_frames(tmp_path / "video.zip", DrivingVideo(frames[..., :3], frames[..., 3:], 5.0))
+    settings = step_settings("fit_motion", SMALL.model_copy(update={"deformation": FramewiseSettings()}))
+    inputs = {"gaussians": gaussians, "driving_video": tmp_path / "video.zip"}
+    (tmp_path / "moving").mkdir()
+    work = job(tmp_path / "moving", settings, inputs, ["motion", "gaussians", "curves", "picture"])
+
+    def fit_and_tear(start, deformation, *_, **__):
+        deformation.requires_grad_(False).table[1, 4, :3] = 2.0  # of one Gaussian at one frame
+        return start
+
+    monkeypatch.setattr(fit_motion, "fit_motion", fit_and_tear)
+    assert fit_motion.run(work).notes[-1].endswith("were dropped: 1.")
+    before, after = read_ply(gaussians), read_ply(work.outputs["gaussians"])
+    rest = [i for i in range(len(before)) if i != 4]
+    assert torch.equal(after.means, before.means[rest])
+    states, _ = read_states(work.outputs["gaussians"], work.outputs["motion"])
+    assert states.means.shape[1] == len(rest) and (states.means - after.means).abs().max() < 1
 
 
 def test_views_of_other_sides_shape_the_start_of_the_fit(tmp_path: Path, subject: Path):

@@ -10,7 +10,11 @@ import torch
 print(threading.active_count(), torch.cuda.is_initialized(), "pymeshlab" in sys.modules, "torch" in sys.modules)
 before = set(sys.modules)
 import numba
-torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+from dg4d_lib.fitting.adam import Adam
+value = torch.zeros(1, requires_grad=True)
+adam = Adam([{"params": value, "lr": 0.1}])
+value.sum().backward()
+adam.step()
 numba.njit(lambda: 0)()
 print(*{name.partition(".")[0] for name in set(sys.modules) - before})
 """

@@ -19,8 +19,11 @@ from dg4d_lib.assets import resample
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.splats import read_splats
+from dg4d_lib.cameras.orbit import FOV_Y_DEG
+from dg4d_lib.cameras.viewpoints import whole_fov_y_deg
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.gaussians.ply import write_ply
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.mesh.texturing.bake import locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
@@ -224,6 +227,17 @@ def test_every_file_stands_on_the_ground_at_its_height(tmp_path: Path) -> None:
     assert camera.radius == pytest.approx(2 * manifest.placement.scale)
     assert camera.target == manifest.placement.translation
     assert camera.target[1] == pytest.approx(center[1].item(), abs=1e-5)  # the gem surrounds the point it looks at
+
+
+def test_the_manifest_says_which_field_of_view_holds_the_whole_animation(package: Path, tmp_path: Path) -> None:
+    assert read_manifest(package).camera.whole_fov_y_deg == FOV_Y_DEG
+    given, large = job(inputs(tmp_path / "inputs"), tmp_path / "out"), replace(cloud(), means=6 * cloud().means)
+    write_ply(given.inputs["gaussians"], large)
+    run(given)
+    with zipfile.ZipFile(given.outputs["package"]) as archive:
+        archive.extract("asset.json", tmp_path)
+    expected = whole_fov_y_deg((large.means + torch.tensor([REACH, 0, 0]))[None])
+    assert FOV_Y_DEG < read_manifest(tmp_path).camera.whole_fov_y_deg == pytest.approx(expected, abs=0.05)
 
 
 def test_the_manifest_leads_back_to_the_fit(package: Path, tmp_path: Path) -> None:

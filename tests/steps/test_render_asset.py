@@ -1,5 +1,6 @@
 """Pictures of a package: right side, right moment, straight alpha, clear refusals."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from shutil import copytree, rmtree
@@ -11,7 +12,7 @@ from small_package import BLUE, FPS, FRAMES, REACH, packed
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from steps.artifacts.media import read_png
-from steps.artifacts.rendering import render_package
+from steps.artifacts.rendering import Renders, render_package
 
 SIZE = 64
 
@@ -26,9 +27,13 @@ def per_frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return packed(tmp_path_factory.mktemp("per_frame"), "per_frame", splats=False)
 
 
-def render(folder: Path, out: Path, azimuths: tuple[float, ...] = (0.0,), **changes: object) -> list[Path]:
+def renders(folder: Path, out: Path, azimuths: tuple[float, ...] = (0.0,), **changes: object) -> Renders:
     wanted = {"elevation_deg": 0.0, "size": SIZE, "frames": None, "mesh": False, "rasterizer": "reference"} | changes
     return render_package(folder, azimuths, out=out, **wanted)  # type: ignore[arg-type]
+
+
+def render(folder: Path, out: Path, azimuths: tuple[float, ...] = (0.0,), **changes: object) -> list[Path]:
+    return renders(folder, out, azimuths, **changes).views
 
 
 def pictures(view: Path) -> torch.Tensor:
@@ -104,6 +109,32 @@ def test_elevation_looks_from_above(package: Path, tmp_path: Path) -> None:
     assert (pictures(above)[0] - upside_down).abs().max() > 0.05
 
 
+def enlarged(package: Path, folder: Path, whole_fov_y_deg: float | None) -> Path:
+    """Copy a package as if its fit were 2.5 times as large."""
+    manifest = json.loads((copytree(package, folder) / "asset.json").read_text())
+    manifest["placement"]["scale"] = 0.4
+    manifest["camera"]["whole_fov_y_deg"] = whole_fov_y_deg
+    (folder / "asset.json").write_text(json.dumps(manifest))
+    return folder
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_cropped_pictures_are_counted_and_the_whole_field_of_view_holds_the_asset(
+    package: Path, tmp_path: Path, mesh: bool
+) -> None:
+    large = enlarged(package, tmp_path / "large", whole_fov_y_deg=120.0)
+    assert renders(package, tmp_path / "0", (0.0, 90.0), mesh=mesh).cropped == 0
+    assert 0 < renders(large, tmp_path / "1", (0.0, 180.0), mesh=mesh).cropped < 2 * FRAMES
+    assert renders(large, tmp_path / "2", (0.0, 180.0), mesh=mesh, fit=True).cropped == 0
+
+
+def test_a_package_that_does_not_know_its_extent_is_not_fitted(package: Path, tmp_path: Path) -> None:
+    older = enlarged(package, tmp_path / "older", whole_fov_y_deg=None)
+    with pytest.raises(BadInput, match="older dg4d made it"):
+        render(older, tmp_path / "out", fit=True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_without_splats_the_fitted_motion_is_drawn(package: Path, tmp_path: Path) -> None:
     bare = copytree(package, tmp_path / "bare")
     rmtree(bare / "splats")
@@ -116,12 +147,6 @@ def test_meshes_per_frame_are_shown_one_after_the_other(per_frame: Path, tmp_pat
     (view,) = render(per_frame, tmp_path, mesh=True, frames=5)
     areas = [float(picture[..., 3].sum()) for picture in pictures(view)]
     assert areas[0] == areas[1] < areas[2] == areas[3] < areas[4]
-
-
-def test_progress_ends_at_the_number_of_pictures(package: Path, tmp_path: Path) -> None:
-    heard: list[tuple[int, int]] = []
-    render(package, tmp_path, (0.0, 90.0), progress=lambda done, total: heard.append((done, total)))
-    assert heard == [(3, 6), (6, 6)]
 
 
 @pytest.mark.parametrize(

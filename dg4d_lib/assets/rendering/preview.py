@@ -19,6 +19,7 @@ from dg4d_lib.cameras.viewpoints import turntable, widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.errors import BackendUnavailable
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import to_bytes
 from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
@@ -67,7 +68,7 @@ def write_preview(
     fps: float,
     rasterizer: Rasterizer,
     settings: PackSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    points: Float[Tensor, "t p 3"],
     mesh_at: Callable[[float], TexturedMesh] | None = None,
 ) -> tuple[str, ...]:
     """Write a silent MP4 (H.264, yuv420p) in which the motion loops `preview_turns` times during one orbit.
@@ -85,7 +86,7 @@ def write_preview(
         fps: frames per second of the motion.
         rasterizer: the splatting backend.
         settings: size and number of loops.
-        progress: called with finished images and their total number.
+        points: output of `shown_points`, which the pictures hold.
         mesh_at: mesh at a position of the motion, in frames; None: the splats alone.
 
     Returns:
@@ -110,16 +111,11 @@ def write_preview(
 
     panels = 1 if mesh_at is None else 2
     orbit = Orbit(len(positions), fps * repeats, settings.preview_size, panels)
-    points = shown_points(gaussians, deformation, frames)
-    return _write_orbit(path, orbit, points, draw, progress)
+    return _write_orbit(path, orbit, points, draw)
 
 
 def write_turntable(
-    path: Path,
-    gaussians: Gaussians,
-    rasterizer: Rasterizer,
-    settings: PackSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    path: Path, gaussians: Gaussians, rasterizer: Rasterizer, settings: PackSettings
 ) -> tuple[str, ...]:
     """Write a silent MP4 (H.264, yuv420p) of one orbit around a single state, starting at the input view's azimuth.
 
@@ -130,7 +126,6 @@ def write_turntable(
         gaussians: one state.
         rasterizer: the splatting backend.
         settings: size.
-        progress: called with finished images and their total number.
 
     Returns:
         Notes for the report: empty, or the name of the fallback codec.
@@ -144,7 +139,7 @@ def write_turntable(
         return render_over(background, gaussians, cameras, rasterizer)
 
     orbit = Orbit(TURN_S * SMOOTH_FPS, SMOOTH_FPS, settings.preview_size, 1)
-    return _write_orbit(path, orbit, _opaque(gaussians)[None], draw, progress)
+    return _write_orbit(path, orbit, _opaque(gaussians)[None], draw)
 
 
 def _write_orbit(
@@ -152,7 +147,6 @@ def _write_orbit(
     orbit: Orbit,
     points: Float[Tensor, "t p 3"],
     draw: Callable[[slice, Sequence[OrbitCamera], Background], Pictures],
-    progress: Callable[[int, int], None],
 ) -> tuple[str, ...]:
     """Write a video of one orbit that shows the points; `draw` returns a range of its images over a background."""
     size, count = orbit.size, orbit.pictures
@@ -162,7 +156,6 @@ def _write_orbit(
         for start in range(0, count, BATCH):
             part = slice(start, start + BATCH)
             video.add(draw(part, cameras[part], background))
-            progress(min(start + BATCH, count), count)
     return () if codec == "libx264" else (f"{path.name} is encoded with {codec}, since this FFmpeg lacks libx264",)
 
 
@@ -248,7 +241,7 @@ class Mp4Writer:
 
     def add(self, pictures: Float[Tensor, "b h w 3"]) -> None:
         """Append images in [0, 1]."""
-        for pixels in (pictures.detach().cpu() * 255).round().to(torch.uint8).numpy():
+        for pixels in to_bytes(pictures).numpy():
             frame = av.VideoFrame.from_ndarray(pixels, "rgb24")
             frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
             self._container.mux(self._stream.encode(frame))

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import pose_gaussians
-from dg4d_lib.assets.rendering.preview import BATCH, render_lit_over, render_over, shown_points
+from dg4d_lib.assets.rendering.preview import BATCH, render_lit_over, render_over
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.images import resize
+from dg4d_lib.images import resize, to_bytes
 from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer
@@ -33,6 +33,7 @@ def draw_contact_sheet(
     video: DrivingVideo,
     rasterizer: Rasterizer,
     settings: PackSettings,
+    points: Float[Tensor, "t p 3"],
     mesh_at: Callable[[int], TexturedMesh] | None = None,
 ) -> Float[Tensor, "h w 3"]:
     """Draw the contact sheet of an asset as an image in [0, 1].
@@ -47,6 +48,7 @@ def draw_contact_sheet(
         video: driving video; determines the number of frames and the frame rate.
         rasterizer: the splatting backend.
         settings: size of a tile, columns and rows.
+        points: output of `shown_points`, which the tiles hold.
         mesh_at: mesh at a frame; None: no rows of meshes.
     """
     columns, size = min(settings.sheet_frames, len(video)), settings.sheet_size
@@ -55,7 +57,7 @@ def draw_contact_sheet(
     states = pose_gaussians(gaussians, deformation, len(video), frames.float())
     azimuths_deg = (0.0, *settings.sheet_azimuths_deg, *settings.sheet_mesh_azimuths_deg)
     views = [OrbitCamera(azimuth_deg=azimuth_deg, width=size, height=size) for azimuth_deg in azimuths_deg]
-    front, *cameras = widened(views, shown_points(gaussians, deformation, len(video)))
+    front, *cameras = widened(views, points)
     rows = [_video_tiles(video, frames, size, views[0].tan_half_fov[0] / front.tan_half_fov[0])]
     of_splats, of_meshes = cameras[: len(settings.sheet_azimuths_deg)], cameras[len(settings.sheet_azimuths_deg) :]
     for camera in of_splats:
@@ -106,8 +108,10 @@ def draw_tiles(
     for row, name in enumerate(names):
         draw.text((left - gap, top + row * (size + gap) + size // 2), name, INK, font, anchor="rm")
         for column in range(len(headings)):
-            pixels = (tiles[row, column].detach().cpu() * 255).round().to(torch.uint8).numpy()
-            sheet.paste(Image.fromarray(pixels), (left + column * (size + gap), top + row * (size + gap)))
+            sheet.paste(
+                Image.fromarray(to_bytes(tiles[row, column]).numpy()),
+                (left + column * (size + gap), top + row * (size + gap)),
+            )
     return torch.from_numpy(np.array(sheet)).float() / 255
 
 

@@ -43,7 +43,8 @@ def build_viewer_page(
         video: the driving video as MP4, played in sync with the asset.
         facts: provenance as nested mappings and lists of strings, numbers and None. Every entry becomes a section; the
             first one is expanded.
-        camera: `radius` and `target` of the input camera, as in `asset.json`; 2 and the origin if missing.
+        camera: `radius` and `target` of the input camera, and `whole_fov_y_deg`, as in `asset.json`; 2, the origin and
+            the field of view of the input if missing.
 
     Raises:
         TypeError, ValueError: the facts cannot be represented as JSON.
@@ -58,7 +59,7 @@ def build_viewer_page(
         )
         if content is not None
     ]
-    view = {name: camera[name] for name in ("radius", "target") if name in camera}
+    view = {name: camera[name] for name in ("radius", "target", "whole_fov_y_deg") if camera.get(name) is not None}
     for name, values in (("facts", facts), ("camera", view)):
         text = json.dumps(values, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
         blocks.append(_block(name, "application/json", text.replace("<", r"\u003c")))

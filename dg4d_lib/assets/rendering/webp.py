@@ -2,20 +2,23 @@
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from dg4d_lib.asset_settings import PackSettings
 from dg4d_lib.assets.animated import pose_gaussians
-from dg4d_lib.assets.rendering.preview import BATCH, render_over, shown_points, studio_background
+from dg4d_lib.assets.rendering.preview import BATCH, render_over, studio_background
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import widened
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.images import to_bytes
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 LARGEST = 256  # maximum side, pixels
@@ -34,7 +37,7 @@ def write_webp(
     fps: float,
     rasterizer: Rasterizer,
     settings: PackSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    points: Float[Tensor, "t p 3"],
 ) -> None:
     """Write an endlessly looping animated WebP of up to 256 pixels a side.
 
@@ -48,7 +51,7 @@ def write_webp(
         fps: frames per second of the motion.
         rasterizer: the splatting backend.
         settings: size of the previews.
-        progress: called with finished images and their total number.
+        points: output of `shown_points`, which the pictures hold.
 
     Raises:
         OSError: the file could not be written.
@@ -61,14 +64,13 @@ def write_webp(
     size = min(LARGEST, settings.preview_size)
     front, background = OrbitCamera(width=size, height=size), studio_background(size)
     swaying = [replace(front, azimuth_deg=SWAY_DEG * math.sin(math.tau * phase)) for phase in phases.tolist()]
-    cameras = widened(swaying, shown_points(gaussians, deformation, frames))
+    cameras = widened(swaying, points)
     pictures: list[Image.Image] = []
     for start in range(0, count, BATCH):
         part = slice(start, start + BATCH)
         states = pose_gaussians(gaussians, deformation, frames, positions[part])
         renders = render_over(background, states, cameras[part], rasterizer)
-        pictures += [Image.fromarray(pixels) for pixels in (renders.cpu() * 255).round().to(torch.uint8).numpy()]
-        progress(len(pictures), count)
+        pictures += [Image.fromarray(pixels) for pixels in to_bytes(renders).numpy()]
     ends_ms = [round(1000 * loops * duration_s * (i + 1) / count) for i in range(count)]
     path.write_bytes(_encode(pictures, [end - start for start, end in zip([0, *ends_ms], ends_ms, strict=False)]))
 

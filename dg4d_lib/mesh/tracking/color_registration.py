@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from skimage.registration import optical_flow_tvl1
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -22,11 +21,12 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
+from dg4d_lib.video.optical_flow import optical_flow
 
 SIZE = 256  # pixels of the compared pictures, at most: flow is finer than a pixel
 WHITE, MARGIN = 0.99, 16  # luminance above which a pixel shows no subject, and pixels around the subject that count
 ROTATIONS = 2  # alternations of rotations and positions
-WARPS = 3  # of the flow; two more take 1.7 times as long and change it by a hundredth of a pixel
+WARPS = 3  # of the flow; two more take 1.4 times as long and change it by a hundredth of a pixel
 HIDDEN_PULL, SHOWN_PULL = 0.1, 1.5  # weights of the positions of hidden and of shown vertices, against 1 per edge
 
 
@@ -105,7 +105,7 @@ def _flow(first: Float[np.ndarray, "h w"], second: Float[np.ndarray, "h w"]) -> 
     shown = np.minimum(first, second) < WHITE
     if shown.any():
         near = surroundings(shown, MARGIN)
-        flow[:, *near] = optical_flow_tvl1(first[near], second[near], num_warp=WARPS)
+        flow[:, *near] = optical_flow(first[near], second[near], WARPS)
     return flow
 
 

@@ -39,7 +39,7 @@ def film(path: Path) -> tuple[np.ndarray, Fraction]:
 @pytest.fixture
 def written(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> Path:
     path = tmp_path / "preview.mp4"
-    assert write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS) == ()
+    assert write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS, red_dot.means[None]) == ()
     return path
 
 
@@ -74,7 +74,7 @@ def test_a_slow_motion_is_not_sampled_without_end(
     tmp_path: Path, red_dot: Gaussians, slide: Framewise, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preview, "MAX_PICTURES", 25)
-    write_preview(tmp_path / "a.mp4", red_dot, slide, FRAMES, 0.5, rasterize, SETTINGS)
+    write_preview(tmp_path / "a.mp4", red_dot, slide, FRAMES, 0.5, rasterize, SETTINGS, red_dot.means[None])
     pictures, rate = film(tmp_path / "a.mp4")
     assert (len(pictures), rate) == (24, 2)
 
@@ -110,7 +110,7 @@ def test_the_mesh_is_beside_the_splats(tmp_path: Path, red_dot: Gaussians, slide
         return TexturedMesh(vertices, faces, uvs, torch.tensor((0.0, 1.0, 0.0)).expand(4, 4, 3).clone())
 
     path = tmp_path / "both.mp4"
-    write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS, mesh_at=mesh_at)
+    write_preview(path, red_dot, slide, FRAMES, FPS, rasterize, SETTINGS, red_dot.means[None], mesh_at=mesh_at)
     pictures, _ = film(path)
     assert pictures.shape == (FRAMES * 3 * 2, 64, 128, 3)
     assert asked[:4] == pytest.approx([0, 1 / 3, 2 / 3, 1])
@@ -138,6 +138,7 @@ def test_the_texture_of_a_moving_mesh_is_prepared_once_per_film(
             FPS,
             rasterize,
             SETTINGS,
+            red_dot.means[None],
             mesh_at=lambda at: replace(mesh, vertices=mesh.vertices + 0.1 * at),
         )
     assert len(prepared) == 2  # once per film
@@ -153,18 +154,8 @@ def test_what_comes_near_the_camera_stays_in_the_picture(tmp_path: Path, red_dot
 
 
 def test_equal_assets_give_equal_films(written: Path, tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    write_preview(tmp_path / "again.mp4", red_dot, slide, FRAMES, FPS, rasterize, SETTINGS)
+    write_preview(tmp_path / "again.mp4", red_dot, slide, FRAMES, FPS, rasterize, SETTINGS, red_dot.means[None])
     assert (tmp_path / "again.mp4").read_bytes() == written.read_bytes()
-
-
-def test_progress_ends_at_the_number_of_pictures(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    heard: list[tuple[int, int]] = []
-
-    def report(done: int, total: int) -> None:
-        heard.append((done, total))
-
-    write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, report)
-    assert heard == [(4, 4)]
 
 
 def test_the_turntable_turns_once_and_nothing_else_moves(tmp_path: Path, red_dot: Gaussians) -> None:
@@ -195,7 +186,7 @@ def test_without_x264_another_codec_stands_in_and_the_report_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(av, "codecs_available", av.codecs_available - {"libx264"})
-    (note,) = write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS)
+    (note,) = write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, red_dot.means[None])
     assert "mpeg4" in note
     assert len(film(tmp_path / "a.mp4")[0]) == 4
 
@@ -208,7 +199,7 @@ def test_without_any_codec_the_backend_is_missing(
 ) -> None:
     monkeypatch.setattr(av, "codecs_available", set())
     with pytest.raises(BackendUnavailable, match="pip install"):
-        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS)
+        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, rasterize, SETTINGS, red_dot.means[None])
 
 
 def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
@@ -216,7 +207,7 @@ def test_a_failure_while_drawing_is_not_hidden(tmp_path: Path, red_dot: Gaussian
         raise ArithmeticError("no picture")
 
     with pytest.raises(ArithmeticError, match="no picture"):
-        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, broken, SETTINGS)
+        write_preview(tmp_path / "a.mp4", red_dot, slide, 2, 30.0, broken, SETTINGS, red_dot.means[None])
 
 
 @pytest.mark.parametrize("codec", preview.CODECS)

@@ -28,7 +28,7 @@ def footage(frames: int) -> DrivingVideo:
 
 @pytest.fixture
 def sheet(red_dot: Gaussians, slide: Framewise) -> torch.Tensor:
-    return draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS)
+    return draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS, red_dot.means[None])
 
 
 def tile(sheet: torch.Tensor, row: int, column: int, rows: int = 3, columns: int = 3) -> torch.Tensor:
@@ -70,10 +70,15 @@ def test_margins_hold_captions_and_gaps_are_white(sheet: torch.Tensor) -> None:
 
 def test_long_captions_are_not_cut_off(red_dot: Gaussians, slide: Framewise) -> None:
     short = draw_contact_sheet(
-        red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(0,))
+        red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(0,)), red_dot.means[None]
     )
     long = draw_contact_sheet(
-        red_dot, slide, footage(2), rasterize, PackSettings(sheet_size=32, sheet_azimuths_deg=(-123.456,))
+        red_dot,
+        slide,
+        footage(2),
+        rasterize,
+        PackSettings(sheet_size=32, sheet_azimuths_deg=(-123.456,)),
+        red_dot.means[None],
     )
     assert long.shape[1] > short.shape[1]
     for page in (short, long):
@@ -82,13 +87,13 @@ def test_long_captions_are_not_cut_off(red_dot: Gaussians, slide: Framewise) -> 
 
 
 def test_a_short_video_has_a_column_per_frame(red_dot: Gaussians, slide: Framewise) -> None:
-    two = draw_contact_sheet(red_dot, slide, footage(2), rasterize, SETTINGS)
-    three = draw_contact_sheet(red_dot, slide, footage(3), rasterize, SETTINGS)
+    two = draw_contact_sheet(red_dot, slide, footage(2), rasterize, SETTINGS, red_dot.means[None])
+    three = draw_contact_sheet(red_dot, slide, footage(3), rasterize, SETTINGS, red_dot.means[None])
     assert three.shape[1] - two.shape[1] == SIZE + GAP
 
 
 def test_equal_assets_give_equal_sheets(sheet: torch.Tensor, red_dot: Gaussians, slide: Framewise) -> None:
-    assert torch.equal(draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS), sheet)
+    assert torch.equal(draw_contact_sheet(red_dot, slide, footage(5), rasterize, SETTINGS, red_dot.means[None]), sheet)
 
 
 def test_rows_of_the_lit_mesh_come_last(red_dot: Gaussians, slide: Framewise) -> None:
@@ -96,7 +101,7 @@ def test_rows_of_the_lit_mesh_come_last(red_dot: Gaussians, slide: Framewise) ->
     vertices, faces = torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces)
     mesh = TexturedMesh(vertices, faces, torch.full((len(vertices), 2), 0.5), torch.full((4, 4, 3), 0.5))
     wanted = SETTINGS.model_copy(update={"sheet_mesh_azimuths_deg": (90.0,)})
-    sheet = draw_contact_sheet(red_dot, slide, footage(5), rasterize, wanted, lambda frame: mesh)
+    sheet = draw_contact_sheet(red_dot, slide, footage(5), rasterize, wanted, red_dot.means[None], lambda frame: mesh)
     shown = tile(sheet, 3, 1, rows=4)[..., 0]
     torch.testing.assert_close(shown[0, 0], torch.tensor(PANEL[0]), atol=1 / 255, rtol=0)
     assert shown[19, 20] > 0.54  # the light comes from the upper left
@@ -116,7 +121,7 @@ def test_what_comes_near_from_behind_is_whole_and_all_tiles_have_one_scale(
     red_dot: Gaussians, slide: Framewise
 ) -> None:
     high = replace(red_dot, means=torch.tensor([[0.0, 0.5, -1.0]]))  # 27 degrees up from behind, where 25 are shown
-    sheet = draw_contact_sheet(high, slide, footage(5), rasterize, SETTINGS)
+    sheet = draw_contact_sheet(high, slide, footage(5), rasterize, SETTINGS, high.means[None])
     redness = (tile(sheet, 2, 0)[..., 0] - tile(sheet, 2, 0)[..., 1]).clip(0)
     assert redness.max() > 0.5
     greenness = (tile(sheet, 0, 0)[..., 1] - tile(sheet, 0, 0)[..., 0]) > 0.5

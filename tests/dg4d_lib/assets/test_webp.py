@@ -37,7 +37,7 @@ def frames(path: Path) -> tuple[np.ndarray, list[int]]:
 
 @pytest.fixture
 def written(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> Path:
-    write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, rasterize, SETTINGS)
+    write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, rasterize, SETTINGS, red_dot.means[None])
     return tmp_path / "a.webp"
 
 
@@ -85,7 +85,7 @@ def test_any_length_is_shown_in_real_time_with_few_pictures(
     tmp_path: Path, red_dot: Gaussians, slide: Framewise, count: int, fps: float, seconds: float, most: int
 ) -> None:
     beside = replace(red_dot, means=torch.tensor([[0.2, 0.0, 0.0]]))  # the camera's sway shows
-    write_webp(tmp_path / "a.webp", beside, slide, count, fps, rasterize, SETTINGS)
+    write_webp(tmp_path / "a.webp", beside, slide, count, fps, rasterize, SETTINGS, beside.means[None])
     pictures, durations = frames(tmp_path / "a.webp")
     assert len(pictures) <= most  # equal neighbors become one
     assert sum(durations) == pytest.approx(1000 * seconds, abs=1)
@@ -97,7 +97,7 @@ def test_it_is_no_larger_than_256_pixels(tmp_path: Path, red_dot: Gaussians, sli
     ) -> Rendering:
         return rendering_of(torch.zeros(len(cameras), cameras[0].height, cameras[0].width, 3))
 
-    write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, blank, PackSettings(preview_size=384))
+    write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, blank, PackSettings(preview_size=384), red_dot.means[None])
     with Image.open(tmp_path / "a.webp") as picture:
         assert picture.size == (256, 256)
 
@@ -112,7 +112,7 @@ def test_what_would_be_too_large_is_packed_harder(
 
     def size(limit: int) -> int:
         monkeypatch.setattr(webp, "MAX_BYTES", limit)
-        write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, noise, SETTINGS)
+        write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, noise, SETTINGS, red_dot.means[None])
         return (tmp_path / "a.webp").stat().st_size
 
     best = size(10**9)
@@ -121,18 +121,8 @@ def test_what_would_be_too_large_is_packed_harder(
 
 
 def test_equal_assets_give_equal_pictures(written: Path, tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    write_webp(tmp_path / "again.webp", red_dot, slide, 2, 1.0, rasterize, SETTINGS)
+    write_webp(tmp_path / "again.webp", red_dot, slide, 2, 1.0, rasterize, SETTINGS, red_dot.means[None])
     assert (tmp_path / "again.webp").read_bytes() == written.read_bytes()
-
-
-def test_progress_ends_at_the_number_of_pictures(tmp_path: Path, red_dot: Gaussians, slide: Framewise) -> None:
-    heard: list[tuple[int, int]] = []
-
-    def report(done: int, total: int) -> None:
-        heard.append((done, total))
-
-    write_webp(tmp_path / "a.webp", red_dot, slide, 2, 1.0, rasterize, SETTINGS, report)
-    assert heard[-1] == (48, 48)
 
 
 def rendering_of(color: Tensor) -> Rendering:

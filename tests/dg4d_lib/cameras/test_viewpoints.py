@@ -1,8 +1,16 @@
 import pytest
 import torch
 
-from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.cameras.viewpoints import MARGIN, baking_views, random_orbit, spread_orbit, turntable, widened
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, OrbitCamera
+from dg4d_lib.cameras.viewpoints import (
+    MARGIN,
+    baking_views,
+    random_orbit,
+    spread_orbit,
+    turntable,
+    whole_fov_y_deg,
+    widened,
+)
 
 
 def test_random_views_stay_in_their_ranges_and_go_all_around():
@@ -70,3 +78,14 @@ def test_what_comes_near_fits_in_the_end():
 def test_strays_are_not_waited_for():
     points = torch.cat([torch.zeros(4000, 3), torch.tensor([[5.0, 0.0, 0.0]])])[None]
     assert widened([OrbitCamera()], points) == [OrbitCamera()]
+
+
+def test_the_whole_is_held_from_all_sides_and_not_by_much_less():
+    points = 1.1 * torch.nn.functional.normalize(
+        torch.randn(1, 400, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+    from_everywhere = spread_orbit(24, elevation_deg=(-90, 90), radius=(2, 2))
+    needed = widened(from_everywhere, points)[0].fov_y_deg
+    assert needed <= whole_fov_y_deg(points) < needed + 1
+    assert whole_fov_y_deg(points / 2) == whole_fov_y_deg(torch.zeros(2, 0, 3)) == FOV_Y_DEG
+    assert whole_fov_y_deg(4 * points) < 180  # beyond the camera

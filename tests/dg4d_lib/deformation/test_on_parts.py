@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from dg4d_lib.deformation.factory import deformation_of_subset
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.on_parts import OnParts
@@ -75,3 +76,13 @@ def test_other_gaussians_and_parts_are_refused(cloud: Gaussians) -> None:
     owners, turn, place = torch.full((COUNT,), 2), torch.ones(1, 2, 4), torch.zeros(1, 2, 3)
     with pytest.raises(BadInput, match="parts from 0 to 1"):
         OnParts(Framewise(1, COUNT), owners, cloud.quats, torch.zeros(2, 3), turn, place)
+
+
+@pytest.mark.parametrize("on_parts", [False, True])
+def test_fewer_gaussians_move_as_before(cloud: Gaussians, on_parts: bool) -> None:
+    whole = lid(cloud) if on_parts else Framewise(FRAMES, COUNT, 0.2, torch.Generator().manual_seed(1))
+    kept, times = cloud.means[:, 0] > 0, torch.tensor([0.0, 0.3, 1.0])
+    fewer = deformation_of_subset(whole, kept).displace(cloud.means[kept], times)
+    expected = whole.displace(cloud.means, times)
+    for name in ("means", "log_scales", "quats"):
+        torch.testing.assert_close(getattr(fewer, name), getattr(expected, name)[:, kept])

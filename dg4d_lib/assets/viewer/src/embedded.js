@@ -22,7 +22,7 @@ export function facts() {
   return JSON.parse(document.getElementById("data-facts").textContent);
 }
 
-/** Returns `radius` and `target` of the input camera; empty in pages without them. */
+/** Returns `radius`, `target` and `whole_fov_y_deg` of the input camera; empty in pages without them. */
 export function camera() {
   return JSON.parse(document.getElementById("data-camera")?.textContent ?? "{}");
 }

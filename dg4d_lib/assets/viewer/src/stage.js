@@ -9,15 +9,22 @@ const NEAREST = 0.3;
 const FARTHEST = 12;
 const MOST_PIXELS_PER_POINT = 2; // sharper screens would only be slower
 
+/** Returns the tangent of half an angle in degrees. */
+const tanHalf = (deg) => Math.tan((deg * Math.PI) / 360);
+
 /** Returns true if the browser supports WebGL 2. */
 export function canDraw() {
   return Boolean(document.createElement("canvas").getContext("webgl2"));
 }
 
 export class Stage {
-  /** `view`: distance `radius` of the input camera and the `target` that it looks at, in the coordinates of the asset. */
-  constructor(element, { radius = RADIUS, target = [0, 0, 0] } = {}) {
+  /**
+   * `view`: distance `radius` of the input camera and the `target` that it looks at, in the coordinates of the asset, and
+   * `whole_fov_y_deg`, the field of view that holds the whole asset from all sides; the camera starts farther away instead.
+   */
+  constructor(element, { radius = RADIUS, target = [0, 0, 0], whole_fov_y_deg: whole = FOV_DEG } = {}) {
     this.element = element;
+    this.start = Math.min(FARTHEST, (RADIUS * tanHalf(whole)) / tanHalf(FOV_DEG));
     this.renderer = new WebGLRenderer({ canvas: element.querySelector("canvas"), antialias: true, alpha: true });
     this.scene = new Scene();
     this.world = new Group(); // shows assets of any size and place as the input camera saw them
@@ -37,13 +44,13 @@ export class Stage {
     this.followPixelRatio();
   }
 
-  /** Resets the camera to the input view. */
+  /** Resets the camera to the direction of the input view, from where the whole asset is seen. */
   reset() {
     this.controls.enableDamping = false;
     this.controls.update(); // stops the damped rotation
     this.controls.enableDamping = true;
     this.controls.target.set(0, 0, 0);
-    this.camera.position.set(0, 0, RADIUS);
+    this.camera.position.set(0, 0, this.start);
     this.controls.update();
     this.stale = true;
   }
@@ -91,7 +98,7 @@ export class Stage {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS_PER_POINT));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    const half = Math.tan((FOV_DEG * Math.PI) / 360) / Math.min(1, this.camera.aspect);
+    const half = tanHalf(FOV_DEG) / Math.min(1, this.camera.aspect);
     this.camera.fov = (360 / Math.PI) * Math.atan(half);
     this.camera.updateProjectionMatrix();
     this.stale = true;

@@ -1,0 +1,50 @@
+"""Gaussians that tear away from the subject while it moves, and float beside it as specks."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from dg4d_lib.gaussians.cloud import Gaussians
+
+EXTENT = 2.0  # standard deviations along the longest axis, to which a Gaussian is seen
+GAP = 0.06  # between the extents of neighbors that belong together, at most; world units
+FEW = 5  # Gaussians that belong together, from which they are a piece of the subject
+NEIGHBORS = 16  # of a Gaussian that it may belong to; more than `FEW`
+MOST = 0.01  # share of strays; where more come off, the cloud is sparse, or the subject falls to pieces
+
+
+def find_strays(states: Gaussians) -> Bool[Tensor, " n"]:
+    """Find Gaussians that are apart from all but a few others at some frames, though not at all of them.
+
+    What is apart at every frame is a piece of the subject, however small.
+
+    Args:
+        states: Gaussians at every frame, world units.
+
+    Returns:
+        True for strays; none are found if they were more than a hundredth of the cloud.
+    """
+    if len(states) < FEW:
+        return torch.zeros(len(states), dtype=torch.bool)
+    extents = EXTENT * states.log_scales.exp().amax(-1)
+    apart = np.stack([_are_apart(*frame) for frame in zip(states.means, extents, strict=True)])
+    strays: Bool[Tensor, " n"] = torch.from_numpy(apart.any(0) & ~apart.all(0))
+    return strays if int(strays.sum()) <= MOST * len(strays) else torch.zeros_like(strays)
+
+
+def _are_apart(means: Float[Tensor, "n 3"], extents: Float[Tensor, " n"]) -> NDArray[np.bool_]:
+    """Return true for Gaussians of clusters of less than `FEW`."""
+    places, reach, count = means.cpu().numpy(), extents.cpu().numpy(), len(means)
+    near = range(1, min(NEIGHBORS + 1, count) + 1)  # the first is itself
+    distances, others = map(np.asarray, cKDTree(places).query(places, near))
+    first, column = np.nonzero(distances - reach[:, None] - reach[others] <= GAP)
+    second = others[first, column]
+    links = coo_array((np.ones(len(first), bool), (first, second)), (count, count))
+    _, clusters = connected_components(links, directed=False)
+    few: NDArray[np.bool_] = (np.bincount(clusters) < FEW)[clusters]
+    return few
