@@ -40,11 +40,14 @@ def find_strays(states: Gaussians) -> Bool[Tensor, " n"]:
 def _are_apart(means: Float[Tensor, "n 3"], extents: Float[Tensor, " n"]) -> NDArray[np.bool_]:
     """Return true for Gaussians of clusters of less than `FEW`."""
     places, reach, count = means.cpu().numpy(), extents.cpu().numpy(), len(means)
-    near = range(1, min(NEIGHBORS + 1, count) + 1)  # the first is itself
-    distances, others = map(np.asarray, cKDTree(places).query(places, near))
-    first, column = np.nonzero(distances - reach[:, None] - reach[others] <= GAP)
-    second = others[first, column]
-    links = coo_array((np.ones(len(first), bool), (first, second)), (count, count))
-    _, clusters = connected_components(links, directed=False)
-    few: NDArray[np.bool_] = (np.bincount(clusters) < FEW)[clusters]
+    tree, few, links = cKDTree(places), np.ones(count, bool), np.zeros((2, 0), int)
+    for neighbors in (FEW - 1, NEIGHBORS):  # most Gaussians are linked to the nearest ones, which are found faster
+        searched = np.flatnonzero(few)
+        near = range(1, min(neighbors + 1, count) + 1)  # the first is itself
+        distances, others = map(np.asarray, tree.query(places[searched], near))
+        row, column = np.nonzero(distances - reach[searched, None] - reach[others] <= GAP)
+        links = np.concatenate([links, [searched[row], others[row, column]]], 1)
+        graph = coo_array((np.ones(links.shape[1], bool), tuple(links)), (count, count))
+        _, clusters = connected_components(graph, directed=False)
+        few = (np.bincount(clusters) < FEW)[clusters]
     return few

@@ -33,12 +33,13 @@ from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Tracked
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
-FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views: the other tries gain nothing
+FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
 )
 SWING = swinging(SOFT)  # for what loses the outline
-OTHERS = (SWING, FLOW)  # beside SOFT, for what keeps it
+BESIDE_SOFT = (SWING, FLOW)  # for what keeps it
+BESIDE_FLOW = (FLOW.model_copy(update={"rigidity_loss": "log"}), SOFT)  # likewise
 SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (0.3, 1.0))  # beside SWING
 CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
 CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
@@ -66,8 +67,14 @@ def tracking_of(known: Bank) -> AssetSettings:
 def most_iterations(known: Bank, video: DrivingVideo, trackings: int) -> int:
     """Return the largest number of iterations that a `SurfaceTracker` reports."""
     first = tracking_of(known)
-    more = (SWING,) if first is FLOW else OTHERS if trackings > 1 else ()  # hulls of few pictures are seldom lost
+    second = (SWING,) if first is FLOW else ()  # hulls of few pictures are seldom lost
+    more = (*second, *_others(first)) if trackings > 1 else second
     return sum(tracking_iterations(settings, video) for settings in (first, *more)) + HINGE_ITERATIONS
+
+
+def _others(first: AssetSettings) -> tuple[AssetSettings, ...]:
+    """Return the other ways of tracking a surface that keeps the outline."""
+    return BESIDE_FLOW if first is FLOW else BESIDE_SOFT
 
 
 class SurfaceTracker:
@@ -75,8 +82,9 @@ class SurfaceTracker:
 
     If the motion is that of a lid or a door on a hinge, the fit of the hinge is the answer. Else a surface that loses
     the outline, or that flow follows badly, is tracked a second time, with limbs that swing; `swinging_is_better`
-    chooses between the two motions. Hulls of few pictures are then tracked in two more ways, whose errors at unseen
-    sides differ: softer and stiffer where limbs swing, else by flow and with limbs that swing.
+    chooses between the two motions. Surfaces are then tracked in two more ways, whose errors at unseen sides differ:
+    softer and stiffer where limbs swing; else hulls of few pictures by flow and with limbs that swing, those of many
+    by flow with few joints that bend a lot, and by descent.
     """
 
     def __init__(
@@ -97,9 +105,9 @@ class SurfaceTracker:
         """
         self._gaussians, self._video, self._rasterize, self._generator = gaussians, video, rasterize, generator
         self._first = tracking_of(known)
-        self._several = trackings > 1 and self._first is SOFT
+        self._several = trackings > 1
         self._most, self._report = most_iterations(known, video, trackings), report
-        self._numbers, self._done = count(), [0] * (3 + len(OTHERS))  # iterations of every tracking
+        self._numbers, self._done = count(), [0] * (3 + len(SWINGS))  # iterations of every tracking
         self._here = threading.get_ident()  # callbacks of a job belong to its thread
         self.hinged: Hinged | None = None  # what a call found
 
@@ -110,8 +118,8 @@ class SurfaceTracker:
             FitDiverged: a loss became non-finite.
         """
         with torch_on_one_thread():
-            ways: Sequence[AssetSettings] = OTHERS
-            share = CARRIED_BESIDE_SEVERAL if self._several else CARRIED_SHARE
+            ways: Sequence[AssetSettings] = _others(self._first)
+            share = CARRIED_BESIDE_SEVERAL if self._several and self._first is SOFT else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
             self.hinged = self._on_a_hinge(moved) if overlap >= LOST else None
@@ -119,9 +127,10 @@ class SurfaceTracker:
                 return Tracked([MovedSurfaces(self.hinged.surfaces)], CARRIED_SHARE)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
-                if not swinging_is_better(overlap, self._overlap(second)):
+                if swinging_is_better(overlap, self._overlap(second)):
+                    moved, ways, share = second, SWINGS, CARRIED_SHARE
+                elif overlap < LOST:
                     return Tracked([moved], CARRIED_SHARE)
-                moved, ways, share = second, SWINGS, CARRIED_SHARE
             others = self._followed_in(ways, surface) if self._several else []
             return Tracked([moved, *others], share)
 

@@ -183,7 +183,7 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
     monkeypatch.setattr(tracking, "SOFT", tracking.SOFT.model_copy(update=small))
-    for name in ("OTHERS", "SWINGS"):
+    for name in ("BESIDE_SOFT", "SWINGS"):
         monkeypatch.setattr(tracking, name, tuple(one.model_copy(update=small) for one in getattr(tracking, name)))
     monkeypatch.setattr(tracking, "SWING", tracking.SWING.model_copy(update=small))
     settings = revise(SMALL, {"motion.track_surface": True})

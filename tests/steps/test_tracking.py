@@ -22,10 +22,17 @@ from dg4d_lib.kernels import workers
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from steps.fitting import tracking
-from steps.fitting.tracking import FLOW, SOFT, SWING, SWINGS, SurfaceTracker, most_iterations
+from steps.fitting.tracking import BESIDE_FLOW, FLOW, SOFT, SWING, SWINGS, SurfaceTracker, most_iterations
 
 SIZE, FRAMES = 64, 3
-WAYS = {"soft": SOFT, "flow": FLOW, "swing": SWING, "softer": SWINGS[0], "stiffer": SWINGS[1]}
+WAYS = {
+    "soft": SOFT,
+    "flow": FLOW,
+    "bent": BESIDE_FLOW[0],
+    "swing": SWING,
+    "softer": SWINGS[0],
+    "stiffer": SWINGS[1],
+}
 
 
 def ball(x: float) -> InflatedSurface:
@@ -58,10 +65,13 @@ ALL_AROUND = list(range(0, 360, 20))
         ([90], {"soft": 0.1, "swing": 0.1, "softer": 0.0, "stiffer": 0.02}, 3, ["swing", "softer", "stiffer"]),
         ([180], {"soft": 0.1, "swing": 0.11}, 1, ["swing"]),  # lost: a smaller overlap does not tell
         ([90, 180], {"soft": 0.1, "swing": 0.3}, 3, ["soft"]),  # far smaller
-        (ALL_AROUND, {"flow": 0.0}, 3, ["flow"]),
-        (ALL_AROUND, {"flow": 0.03, "swing": 0.0}, 3, ["swing"]),
-        (ALL_AROUND, {"flow": 0.03, "swing": 0.03}, 3, ["flow"]),  # not lost, and no gain
-        (ALL_AROUND, {"flow": 0.1, "swing": 0.11}, 3, ["swing"]),
+        (ALL_AROUND, {"flow": 0.0}, 1, ["flow"]),
+        (ALL_AROUND, {"flow": 0.0, "bent": 0.1, "soft": 0.05}, 3, ["flow", "bent", "soft"]),
+        (ALL_AROUND, {"flow": 0.03, "swing": 0.0}, 1, ["swing"]),
+        (ALL_AROUND, {"flow": 0.03, "swing": 0.03}, 1, ["flow"]),  # not lost, and no gain
+        (ALL_AROUND, {"flow": 0.03, "swing": 0.03, "bent": 0.0, "soft": 0.0}, 3, ["flow", "bent", "soft"]),
+        (ALL_AROUND, {"flow": 0.1, "swing": 0.11, "softer": 0.0, "stiffer": 0.02}, 3, ["swing", "softer", "stiffer"]),
+        (ALL_AROUND, {"flow": 0.1, "swing": 0.3}, 3, ["flow"]),  # lost in both
     ],
 )
 def test_how_a_surface_is_tracked_depends_on_how_it_keeps_the_outline(

@@ -35,7 +35,7 @@ from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import MeshSettings
 
-SHARPNESS = 2  # exponent of a view's weight in the cosine above the minimum; views blend without seams
+SHARPNESS = 2  # exponent of a view's weight in cosine above the minimum and reliable share; views blend without seams
 INPUT_WEIGHT = 200.0  # weight of the input view relative to others; only its colors come from a photograph
 MIN_COSINE = 0.5  # texels seen at a more oblique angle are not colored
 INPUT_MIN_COSINE = 0.6 * MIN_COSINE  # likewise in the input view: a stretched true color beats a guessed one
@@ -397,15 +397,19 @@ def _gather(positions, normals, pose, eye, focal, color, grade, depth, front, mi
         slope = far / focal / max(cosine, 0.2)  # upper bound of the depth change of a tilted surface within a pixel
         if grade[row, column] == 0 or far - DEPTH_SLACK * slope > depth[row, column]:
             continue
-        beside = far - (DEPTH_SLACK + 1.5 * OUTLINE) * slope <= front[row, column]  # no occluding edge nearby
-        facing = (cosine - min_cosine) / (1 - min_cosine) if beside and grade[row, column] == 2 else 0.0
-        weight = boost * max(facing, 0.0) ** SHARPNESS + LAST_RESORT * cosine
         left, top = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
         c0, r0 = int(left), int(top)
         c1, r1 = min(c0 + 1, width - 1), min(r0 + 1, height - 1)
         a, b = left - c0, top - r0
-        for k in range(3):
-            upper = (1 - a) * color[r0, c0, k] + a * color[r0, c1, k]
-            lower = (1 - a) * color[r1, c0, k] + a * color[r1, c1, k]
-            total[i, k] += weight * ((1 - b) * upper + b * lower)
+        taps = (r0, c0, (1 - a) * (1 - b)), (r0, c1, a * (1 - b)), (r1, c0, (1 - a) * b), (r1, c1, a * b)
+        reliable = 0.0  # share of the bilinear reading; that of the nearest pixel would be stairs in the texture
+        for row, column, share in taps:
+            beside = far - (DEPTH_SLACK + 1.5 * OUTLINE) * slope <= front[row, column]  # no occluding edge nearby
+            if grade[row, column] == INSIDE and beside and far - DEPTH_SLACK * slope <= depth[row, column]:
+                reliable += share
+        facing = max((cosine - min_cosine) / (1 - min_cosine), 0.0)
+        weight = boost * (facing * reliable) ** SHARPNESS + LAST_RESORT * cosine
+        for row, column, share in taps:
+            for k in range(3):
+                total[i, k] += weight * share * color[row, column, k]
         total[i, 3] += weight

@@ -19,15 +19,15 @@ from torch import Tensor
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.kernels.workers import torch_on_one_thread
 from dg4d_lib.mesh.textured import TexturedMesh
-from dg4d_lib.mesh.texturing.bake import INSIDE, PosedSurface, grade_pixels
+from dg4d_lib.mesh.texturing.bake import INSIDE, PosedSurface, covered_texels, grade_pixels
 from dg4d_lib.mesh.texturing.seams import level_seams, seam_points
 from dg4d_lib.mesh_rasterizer.texture import Taps, TextureLookup, build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 SAMPLES = 2  # per pixel along each axis
-ITERATIONS = 4  # of conjugate gradients
-KEPT = 0.1  # weight of a texel's squared change; that of a pixel's squared error is 1
-EVEN = 0.1  # weight of the squared difference between the changes of neighboring texels
+ITERATIONS = 5  # of conjugate gradients
+KEPT = 0.02  # weight of a texel's squared change; that of a pixel's squared error is 1
+EVEN = 0.5  # weight of the squared difference between the changes of neighboring texels
 UNRELIABLE = 0.3  # weight of a pixel beside an outline or behind an occluding edge
 STEP = 15  # pixel sides, at the depth of a pixel: a neighbor that is nearer by more occludes
 
@@ -71,13 +71,16 @@ def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
     if not pixels:
         return mesh.texture
     with torch_on_one_thread():  # sums of several threads depend on their number
-        texture = mesh.texture + _best_change(mesh.texture, _joined(pixels))
+        covered = covered_texels(mesh.faces, mesh.uvs, len(mesh.texture))
+        inside = torch.zeros(mesh.texture.shape[:2], dtype=torch.bool)
+        inside[covered.rows, covered.columns] = True
+        texture = mesh.texture + _best_change(mesh.texture, inside, _joined(pixels))
     points = seam_points(mesh.vertices, mesh.faces, mesh.uvs, len(texture))
     return level_seams(texture.clamp(0, 1), points)
 
 
-def _best_change(start: Texture, frames: _Pixels) -> Texture:
-    """Return what to add to a texture."""
+def _best_change(start: Texture, inside: Bool[Tensor, "h w"], frames: _Pixels) -> Texture:
+    """Return what to add to a texture, whose texels inside of charts are given."""
     variable = start.clone().requires_grad_()
     seen = frames.render(variable)
 
@@ -86,20 +89,20 @@ def _best_change(start: Texture, frames: _Pixels) -> Texture:
         (gradient,) = torch.autograd.grad(seen, variable, frames.weights * errors, retain_graph=True)
         return gradient
 
-    def normal(flat: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normal(flat: NDArray[np.float32]) -> NDArray[np.float32]:
         change = torch.from_numpy(flat.reshape(start.shape)).to(start)
         with torch.no_grad():
             rendered = frames.render(change)
-        return _flat(spread(rendered) + KEPT * change + EVEN * _differences(change))
+        return _flat(spread(rendered) + KEPT * change + EVEN * _differences(change, inside))
 
     diagonal = _flat(spread(torch.ones_like(seen)) + KEPT + 4 * EVEN)
-    matrix, scale = LinearOperator(2 * diagonal.shape, normal, dtype=np.float64), diags_array(1 / diagonal)
+    matrix, scale = LinearOperator(2 * diagonal.shape, normal, dtype=np.float32), diags_array(1 / diagonal)
     change, _ = cg(matrix, _flat(spread(frames.colors - seen.detach())), rtol=0, maxiter=ITERATIONS, M=scale)
     return torch.from_numpy(change.reshape(start.shape)).to(start)
 
 
-def _flat(texture: Texture) -> NDArray[np.float64]:
-    return texture.double().numpy().ravel()
+def _flat(texture: Texture) -> NDArray[np.float32]:
+    return texture.numpy().ravel()
 
 
 def _seen_pixels(mesh: TexturedMesh, surface: PosedSurface) -> _Pixels | None:
@@ -148,9 +151,13 @@ def _joined(parts: Sequence[_Pixels]) -> _Pixels:
     return _Pixels(TextureLookup(covered, tuple(levels)), torch.cat(pixels), colors, weights)
 
 
-def _differences(texture: Texture) -> Texture:
-    """Return the gradient of half the sum of squared differences between neighboring texels."""
-    down, right = texture.diff(dim=0), texture.diff(dim=1)
+def _differences(texture: Texture, inside: Bool[Tensor, "h w"]) -> Texture:
+    """Return the gradient of half the sum of squared differences between neighbors, one of them inside of a chart.
+
+    Charts are two texels apart, so that none has an effect on another.
+    """
+    down = texture.diff(dim=0) * (inside[1:] | inside[:-1])[..., None]
+    right = texture.diff(dim=1) * (inside[:, 1:] | inside[:, :-1])[..., None]
     gradient = torch.zeros_like(texture)
     gradient[1:] += down
     gradient[:-1] -= down

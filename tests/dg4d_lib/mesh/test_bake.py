@@ -127,6 +127,28 @@ def test_footage_is_averaged_by_weight(sphere: Mesh, sphere_of_gaussians: Cloud)
     assert (texture[texels.rows, texels.columns][shown] - 0.75 * GREEN).abs().max() < 0.05
 
 
+def test_footage_fades_out_within_a_pixel_of_its_outline(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
+    """A green frame that ends in the middle of the sphere, and a black one; a pixel is six texels wide."""
+    side, settings = 24, MeshSettings(texture_size=256, render_size=128)
+    vertices, normals, corners, uvs = flattened(*sphere)
+    left = (torch.arange(side) <= side // 2)[None, :, None].expand(side, side, 1).float()
+    whole, green = torch.ones(side, side, 1), GREEN.expand(side, side, 3)
+    footage = [
+        PosedSurface(vertices, normals, green, left),
+        PosedSurface(vertices, normals, torch.zeros_like(green), whole),
+    ]
+    draw = drawn_gaussians(sphere_of_gaussians(600), get_rasterizer("auto"))
+    texture = bake_texture(vertices, normals, corners, uvs, draw, settings, footage)
+    texels = locate_texels(vertices, normals, corners, uvs, settings.texture_size)
+    shown = torch.zeros(texture.shape[:2], dtype=torch.bool)
+    shown[texels.rows, texels.columns] = texels.normals[:, 2] > 0.85
+    jumps = [
+        texture[..., 1].diff(dim=axis).abs()[shown.narrow(axis, 1, 255) & shown.narrow(axis, 0, 255)] for axis in (0, 1)
+    ]
+    assert texture[shown][:, 1].max() > 0.35 and texture[shown][:, 1].min() < 0.05
+    assert max(float(jump.max()) for jump in jumps) < 0.2
+
+
 def test_transparent_footage_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
     mesh, gaussians = flattened(*sphere), sphere_of_gaussians(600, 0.5, red_and_blue)
     nothing = PosedSurface(*mesh[:2], *green_frame(0.0))

@@ -86,6 +86,26 @@ def test_renders_come_closer_to_frames_than_an_average_of_their_colors(ball: Tex
     assert error(replace(ball, texture=fit_texture(start, frames))) < 0.2 * error(start)
 
 
+def test_frames_that_are_slightly_misplaced_add_no_weave(ball: TexturedMesh) -> None:
+    truth = painted(ball)
+    frames = [frame_of(truth, 0.1 * step) for step in range(-4, 5)]
+    shifts = (0.03, -0.02, 0.01, -0.03, 0.02, -0.01, 0.03, -0.02, 0.01)
+    misplaced = [
+        replace(frame, vertices=turned(ball, 0.1 * step + shift))
+        for frame, step, shift in zip(frames, range(-4, 5), shifts, strict=True)
+    ]
+    kernel = torch.tensor([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]]).expand(3, 1, 3, 3)
+    facing = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    texels = locate_texels(ball.vertices, ball.vertices, ball.faces, ball.uvs, SIZE)
+    facing[texels.rows, texels.columns] = texels.normals @ TOWARDS > 0.6
+    inside = conv2d(facing[None, None].float(), torch.ones(1, 1, 3, 3), padding=1)[0, 0] == 9
+
+    def roughness(texture: torch.Tensor) -> float:
+        return float(conv2d(texture.movedim(-1, 0)[None], kernel, padding=1, groups=3)[0, :, inside].square().mean())
+
+    assert roughness(fit_texture(truth, misplaced)) < 1.9 * roughness(truth.texture)
+
+
 def test_nothing_of_a_background_enters_where_the_mesh_is_too_large(ball: TexturedMesh) -> None:
     frame = frame_of(ball)
     left = (torch.arange(PIXELS) < PIXELS // 2)[None, :, None]

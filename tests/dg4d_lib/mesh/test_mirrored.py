@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.bake import PosedSurface, Texels, locate_texels
@@ -84,3 +85,27 @@ def test_nothing_changes_where_the_mirror_image_is_off_the_surface(ball: Ball) -
     back = texels.positions[:, 2] / texels.positions.norm(dim=1) < -0.5
     assert share == 0
     assert (texture[texels.rows, texels.columns][back] - GRAY).abs().mean() < 0.001
+
+
+def test_a_mirror_image_colors_no_surface_that_faces_elsewhere(ball: Ball) -> None:
+    """The mirror image of a small ball overlaps the ball, half of its size to one side."""
+    mesh, normals, texels = ball
+    small = replace(mesh, vertices=0.12 * mesh.vertices)
+    across = torch.tensor([0.0, 0.5, 0.75**0.5])
+    texture, share = mirror_texture(small, [shown(small, normals)], MirrorPlane(across, 0.06 * across, 1.0))
+    change = (texture - mesh.texture)[texels.rows, texels.columns]
+    assert share < 0.01
+    assert change.abs().mean() < 0.005
+
+
+def test_what_frames_show_beside_their_outline_keeps_its_color(ball: Ball) -> None:
+    """A plane between the axes x and z takes the left outline of the ball to the middle of its front."""
+    mesh, normals, texels = ball
+    plane = MirrorPlane(torch.tensor([0.5**0.5, 0.0, 0.5**0.5]), torch.zeros(3), 1.0)
+    texture, _ = mirror_texture(mesh, 16 * [shown(mesh, normals)], plane)
+    towards = torch.nn.functional.normalize(OrbitCamera().position().float() - texels.positions, dim=-1)
+    cosine = (texels.normals * towards).sum(-1)
+    outline = (cosine > 0.15) & (cosine < 0.3) & (texels.normals[:, 0] < -0.8)
+    change = (texture - mesh.texture)[texels.rows, texels.columns][outline]
+    assert outline.sum() > 100
+    assert change.abs().mean() < 0.1
