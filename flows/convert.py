@@ -18,7 +18,7 @@ from flows.packages.publish import Files, check_folder, is_current, recover
 from flows.serving import background
 from flows.serving.server import ServerUnavailable
 from steps.artifacts.archives import unpack
-from steps.runtime.process_setup import collector_resting
+from steps.runtime.process_setup import garbage_collection_paused
 from steps.store.artifact_store import ArtifactMissing
 from steps.store.files import home as store_home
 
@@ -63,7 +63,7 @@ def connect() -> None:
             raise ServerUnavailable(f"another program took the port of the Prefect server at {given}; run this again")
         background.set_own_server(server, address)
         _announce("importing the flows")
-        with collector_resting():
+        with garbage_collection_paused():
             importlib.import_module("flows.pipeline")  # takes seconds, as the start of the server does
         _announce("waiting for the Prefect server")
         server.wait()

@@ -49,7 +49,7 @@ class Gaussians(StepResult):
 
 
 class Motion(StepResult):
-    """Deformation over time; with the Gaussians if they were fine-tuned together with it."""
+    """Deformation over time; with the Gaussians if they were fine-tuned or strays were dropped."""
 
 
 class Plan(StepResult):

@@ -25,7 +25,7 @@ FRONT_DEG, SIDE_DEG = 0.0, 90.0
 
 
 def run(job: Job) -> StepReport:
-    """Fit the deformation, with `fine_tune` also the Gaussians; render six timestamps from front and side."""
+    """Fit the deformation, with `fine_tune` also the Gaussians; drop strays; render six timestamps of two sides."""
     backend, prior = job.settings.rasterizer, job.settings.prior
     pose = job.inputs.get("pose") if "known_views" not in job.inputs else None
     hint = subject_hint(prior, pose, job.inputs.get("depth_field"), job.settings.turn_deg)

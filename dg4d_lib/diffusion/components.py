@@ -184,9 +184,12 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
         if file.suffix == ".json":
             shards = sorted(set(dict(json.loads(file.read_text(encoding="utf-8"))["weight_map"]).values()))
             return {key: tensor for shard in shards for key, tensor in read_tensors(_shard(file, shard)).items()}
-        return dict(torch.load(file, map_location="cpu", weights_only=True))
+        tensors: dict[str, Tensor] = dict(torch.load(file, map_location="cpu", weights_only=True))
     except UNREADABLE as error:
         raise BadInput(f"{file} cannot be read: {_first_line(error)}") from error
+    if other := [key for key, value in tensors.items() if not (isinstance(key, str) and isinstance(value, Tensor))]:
+        raise BadInput(f"{file} is no file of named tensors: {quoted(other[0])} is none; give the weights alone")
+    return tensors
 
 
 def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:

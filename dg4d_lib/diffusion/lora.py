@@ -13,7 +13,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from dg4d_lib.diffusion.components import read_tensors
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from dg4d_lib.weights.locate import TENSOR_SUFFIXES
 
 PREFIXES = ("transformer.", "diffusion_model.", "model.diffusion_model.", "base_model.model.")
@@ -98,18 +98,19 @@ def _read_factors(file: Path) -> dict[str, _Factors]:
     for key, tensor in tensors.items():
         if (found := FACTOR.match(key)) is not None:
             (down if found["factor"] in DOWN else up)[found["layer"]] = tensor
-        elif not key.endswith(".alpha"):
+        elif not key.endswith(".alpha") or tensor.numel() != 1:
             others.append(key)
     if not down or set(down) != set(up) or any(one.ndim != 2 for one in (*down.values(), *up.values())):
         raise BadInput(f"{file} is no LoRA of linear layers; give one that was made for this network")
     adapter = _read_adapter(file)
     if others or adapter.use_dora:
-        rest = f"{min(others)} ({len(others)} such tensors)" if others else "use_dora in its metadata"
+        rest = f"{quoted(min(others))} ({len(others)} such tensors)" if others else "use_dora in its metadata"
         raise BadInput(
             f"{file} is more than a LoRA: {rest} cannot be merged; give a LoRA of factors and alphas alone, without "
             "DoRA, biases, LoKr or full differences"
         )
-    if broken := sorted(key for key, tensor in tensors.items() if not tensor.isfinite().all()):
+    # torch has no isfinite for float8
+    if broken := sorted(key for key, tensor in tensors.items() if not tensor.float().isfinite().all()):
         raise BadInput(f"{file} is damaged: {broken[0]} has values that are not finite; download or train it again")
     return {
         _layer_name(name): _Factors(down[name], up[name], _scaling(tensors, adapter, name, down[name].shape[0]))

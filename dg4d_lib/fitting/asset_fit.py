@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dg4d_lib.adam import Adam
 from dg4d_lib.asset_settings import AssetSettings
 from dg4d_lib.cameras.orbit import OrbitCamera
-from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.flow_tracking import DEPTH_SLACK, across_weight
 from dg4d_lib.fitting.losses import WHITE, check_finite, pyramid_error, pyramid_residuals, resize_cutouts
 from dg4d_lib.fitting.node_motion import NodeBasis, NodeMotion, NodeVariables
@@ -108,7 +108,7 @@ class AssetFit:
         if frame < 2:
             return tracked[-1]
         if not self.basis.integrated:
-            return tracked[-2].continued(tracked[-1])
+            return tracked[-2].continued(tracked[-1], CONTINUED)
         starts = [tracked[-2].continued(tracked[-1], speed) for speed in SPEEDS]
         picture = torch.cat([self.colors, self.alphas], -1)
         errors = [float(pyramid_error(picture[frame : frame + 1], picture[k : k + 1])) for k in range(frame)]

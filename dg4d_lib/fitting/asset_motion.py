@@ -106,7 +106,7 @@ def _fitted(
     """Track all frames, then refine them together."""
     frames, done = len(video), settings.track_iterations * len(video)
     track = _followed if settings.tracking == "flow" else _descended
-    variables = NodeVariables.joined(track(fit, video, settings, report))
+    variables = NodeVariables.joined(track(fit, video, settings, report)).trainable()
     descent = NodeDescent(variables, fit.basis, held=int(fit.resting))
     for step in range(settings.joint_iterations):
         chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
@@ -158,7 +158,7 @@ def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, repo
     done = settings.track_iterations * (len(tracked) - 1)
     for frame in range(len(tracked) - 1, len(video)):
         start = fit.start(tracked, frame)
-        variables, steps = start.copy(), settings.track_iterations
+        variables, steps = start.trainable(), settings.track_iterations
         descent = NodeDescent(variables, fit.basis)
         expected = start.motion(fit.basis).nodes(fit.graph).detach()
         targets = fit.flow_targets(tracked[-1].motion(fit.basis), frame) if frame else None

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.adam import Adam
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
-from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.asset_fit import antialiased
 from dg4d_lib.fitting.losses import WHITE, resize_cutouts
 from dg4d_lib.gaussians.cloud import Gaussians

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from dg4d_lib.adam import Adam
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.cameras.viewpoints import random_orbit
 from dg4d_lib.deformation.interface import Deformation
 from dg4d_lib.deformation.rigidity_loss import neighborhoods, rigidity_loss
 from dg4d_lib.devices import to_device_async
-from dg4d_lib.fitting.adam import Adam
 from dg4d_lib.fitting.losses import WHITE, check_finite, reference_loss, resize_cutouts
 from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.fitting.static import draw_view, learning_rates

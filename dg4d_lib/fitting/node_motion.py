@@ -5,7 +5,6 @@ Variables are smoothed over the graph, so that nodes that the video does not sho
 and shifts are added: a step that turns a shoulder swings the arm, where along shifts alone a raised wing would shrink.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,8 +13,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from dg4d_lib.fitting.frame_variables import FrameVariables
 from dg4d_lib.fitting.node_kernels import has_kernels, moved_points, turned_edges
-from dg4d_lib.fitting.node_pose import CONTINUED, Pose
+from dg4d_lib.fitting.node_pose import Pose
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
@@ -113,7 +113,7 @@ class NodeBasis:
 
 
 @dataclass(frozen=True)
-class NodeVariables:
+class NodeVariables(FrameVariables):
     """Transforms of the nodes and of the whole before smoothing, rotations as vectors.
 
     Attributes:
@@ -143,25 +143,6 @@ class NodeVariables:
         remaining = shifts - basis.integral(quats[None])[0]
         rough = [torch.linalg.solve(basis.smoothing, one)[None] for one in (turns, remaining)]
         return cls(rough[0], rough[1], whole, whole)
-
-    @classmethod
-    def joined(cls, frames: Sequence["NodeVariables"]) -> "NodeVariables":
-        """Return the variables of several frames, ready for a descent."""
-        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])}).copy()
-
-    def copy(self) -> "NodeVariables":
-        """Return a copy that gradients are computed for."""
-        return NodeVariables(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
-
-    def detach(self) -> "NodeVariables":
-        """Return the variables without gradients."""
-        return NodeVariables(**{name: value.detach() for name, value in vars(self).items()})
-
-    def continued(self, last: "NodeVariables", speed: float = CONTINUED) -> "NodeVariables":
-        """Extrapolate from this frame over the last one, by a share of the motion between them."""
-        return NodeVariables(
-            **{name: getattr(last, name) + speed * (getattr(last, name) - value) for name, value in vars(self).items()}
-        )
 
     def motion(self, basis: NodeBasis) -> NodeMotion:
         """Return the motion of nodes and whole."""

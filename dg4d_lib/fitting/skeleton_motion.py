@@ -19,6 +19,7 @@ from dg4d_lib.cameras.orbit import RADIUS
 from dg4d_lib.fitting.asset_fit import AssetFit
 from dg4d_lib.fitting.asset_motion import thinned_graph
 from dg4d_lib.fitting.asset_pose import Placement
+from dg4d_lib.fitting.frame_variables import FrameVariables
 from dg4d_lib.fitting.losses import check_finite
 from dg4d_lib.fitting.node_motion import Descent, NodeMotion
 from dg4d_lib.gaussians.cloud import Gaussians
@@ -45,7 +46,7 @@ Report = Callable[[int, dict[str, float]], None]
 
 
 @dataclass(frozen=True)
-class JointVariables:
+class JointVariables(FrameVariables):
     """Rotations of joints relative to their parents, and motion of the whole about the first node.
 
     Rotations are vectors along the axis of twice the tangent of half the angle.
@@ -73,25 +74,6 @@ class JointVariables:
         """The same rotations, of a model that stays in its place."""
         return replace(
             self, whole_shift=torch.zeros_like(self.whole_shift), whole_depth=torch.zeros_like(self.whole_depth)
-        )
-
-    @classmethod
-    def joined(cls, frames: list["JointVariables"]) -> "JointVariables":
-        """Return the variables of several frames."""
-        return cls(**{name: torch.cat([getattr(one, name) for one in frames]) for name in vars(frames[0])})
-
-    def ready(self) -> "JointVariables":
-        """Return a copy that gradients are computed for."""
-        return JointVariables(**{name: value.detach().clone().requires_grad_() for name, value in vars(self).items()})
-
-    def detach(self) -> "JointVariables":
-        """Return the variables without gradients."""
-        return JointVariables(**{name: value.detach() for name, value in vars(self).items()})
-
-    def continued(self, before: "JointVariables") -> "JointVariables":
-        """Extrapolate from the frame before this one."""
-        return JointVariables(
-            **{name: value + CONTINUED * (value - getattr(before, name)) for name, value in vars(self).items()}
         )
 
 
@@ -156,7 +138,7 @@ def fit_skeleton_motion(
     search = _Search(cloud, joints, video, rasterize, steady, report)
     poses = [search.first_pose()]
     for frame in range(1, len(video)):
-        start = poses[-1] if frame == 1 else poses[-1].continued(poses[-2])
+        start = poses[-1] if frame == 1 else poses[-2].continued(poses[-1], CONTINUED)
         rough, _ = search.descended(search.coarse, start, frame, TRACKED, TRACKING, steady=True)
         poses.append(search.descended(search.fine, rough, frame, TRUED, FINER, steady=True)[0])
     return search.together(JointVariables.joined(poses), generator)
@@ -265,7 +247,7 @@ class _Search:
         steady: bool = False,
     ) -> tuple[JointVariables, float]:
         """Descend from a start; also return the loss of the pictures. With `steady`, changes cost something."""
-        variables = start.ready()
+        variables = start.trainable()
         descent = Descent(vars(variables), FACTORS, evenness=EVENNESS)
         loss = float("inf")
         for step in range(iterations):
@@ -279,7 +261,7 @@ class _Search:
 
     def together(self, start: JointVariables, generator: torch.Generator) -> NodeMotion:
         """Refine all frames together."""
-        variables, frames, iterations = start.ready(), len(start.turns), self.settings.joint_iterations
+        variables, frames, iterations = start.trainable(), len(start.turns), self.settings.joint_iterations
         descent = Descent(vars(variables), FACTORS, evenness=EVENNESS)
         for step in range(iterations):
             count = min(self.settings.joint_frames, frames)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -40,14 +40,29 @@ def find_strays(states: Gaussians) -> Bool[Tensor, " n"]:
 def _are_apart(means: Float[Tensor, "n 3"], extents: Float[Tensor, " n"]) -> NDArray[np.bool_]:
     """Return true for Gaussians of clusters of less than `FEW`."""
     places, reach, count = means.cpu().numpy(), extents.cpu().numpy(), len(means)
-    tree, few, links = cKDTree(places), np.ones(count, bool), np.zeros((2, 0), int)
-    for neighbors in (FEW - 1, NEIGHBORS):  # most Gaussians are linked to the nearest ones, which are found faster
-        searched = np.flatnonzero(few)
-        near = range(1, min(neighbors + 1, count) + 1)  # the first is itself
-        distances, others = map(np.asarray, tree.query(places[searched], near))
-        row, column = np.nonzero(distances - reach[searched, None] - reach[others] <= GAP)
-        links = np.concatenate([links, [searched[row], others[row, column]]], 1)
-        graph = coo_array((np.ones(links.shape[1], bool), tuple(links)), (count, count))
-        _, clusters = connected_components(graph, directed=False)
-        few = (np.bincount(clusters) < FEW)[clusters]
+    tree = cKDTree(places)
+    links = _links(tree, reach, np.arange(count), FEW - 1)  # enough for most Gaussians, and found faster
+    few = _are_few(links, count)
+    if few.any():
+        distances, _ = cKDTree(places[few]).query(places)
+        close = np.flatnonzero(distances <= GAP + reach + reach[few].max())  # all others have no links to the few
+        few = _are_few(np.concatenate([links, _links(tree, reach, close, NEIGHBORS)], 1), count)
+    return few
+
+
+def _links(
+    tree: cKDTree, reach: Float[np.ndarray, " n"], searched: Int[np.ndarray, " m"], neighbors: int
+) -> Int[np.ndarray, "2 k"]:
+    """Return pairs that belong together: some Gaussians and those of their nearest neighbors within the gap."""
+    near = range(1, min(neighbors + 1, len(reach)) + 1)  # the first is itself
+    distances, others = map(np.asarray, tree.query(tree.data[searched], near))
+    row, column = np.nonzero(distances - reach[searched, None] - reach[others] <= GAP)
+    return np.stack([searched[row], others[row, column]])
+
+
+def _are_few(links: Int[np.ndarray, "2 k"], count: int) -> NDArray[np.bool_]:
+    """Return true for Gaussians of clusters of less than `FEW`."""
+    graph = coo_array((np.ones(links.shape[1], bool), tuple(links)), (count, count))
+    _, clusters = connected_components(graph, directed=False)
+    few: NDArray[np.bool_] = (np.bincount(clusters) < FEW)[clusters]
     return few

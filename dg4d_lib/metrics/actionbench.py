@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from dg4d_lib.adam import Adam
 from dg4d_lib.errors import BadInput
 
 LEARNING_RATE, ITERATIONS = 0.01, 200  # Adam, per alignment (published)
@@ -148,7 +149,7 @@ def _descend(
     scale = points.new_ones(count, 3).requires_grad_()
     rows = torch.eye(3).to(points)[:2].expand(count, 2, 3).clone().requires_grad_()
     translation = points.new_zeros(count, 3).requires_grad_()
-    adam = torch.optim.Adam([translation, rows, scale], lr=LEARNING_RATE)
+    adam = Adam([{"params": [translation, rows, scale], "lr": LEARNING_RATE}])
     best = points.new_full((count,), torch.inf)
     kept = [value.detach().clone() for value in (scale, starts, translation)]
     for _ in range(iterations):

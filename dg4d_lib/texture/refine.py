@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from dg4d_lib.adam import Adam
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.geometry.normals import vertex_normals
@@ -108,7 +109,7 @@ def refine_textures(
         {"params": logits, "lr": settings.lr, "eps": shared_eps},
         {"params": trained, "lr": MAX_SLOPE * settings.lr, "eps": frame_eps},
     ]
-    adam = torch.optim.Adam(groups if trained else groups[:1])
+    adam = Adam(groups)
     for iteration in range(settings.iterations):
         colors = [logit.sigmoid() for logit in logits]
         if iteration % settings.refresh_every == 0:

@@ -34,7 +34,7 @@ def optical_flow(
     """Return rows and columns by which every pixel of the first picture moves to where the second one shows it.
 
     Args:
-        first: gray values, about [0, 1]; at least 2 x 2 pixels.
+        first: finite gray values, about [0, 1]; at least 2 x 2 pixels.
         second: likewise.
         warps: linearizations at every level of the pyramid, at most; fewer are faster and less exact.
 

@@ -63,7 +63,7 @@ def exit_on_error() -> Iterator[None]:
                 _end(STOPPED, CODES[received[0]])
             if isinstance(error, BrokenPipeError) and _output_closed():
                 raise typer.Exit(EXIT_PIPE) from None  # as `dg4d settings | head`
-            _end(*_describe(error))
+            _end(*describe(error))
 
 
 @contextmanager
@@ -105,7 +105,8 @@ def _is_unwinding() -> bool:
     return error is not None
 
 
-def _describe(error: Exception) -> tuple[str, int]:
+def describe(error: Exception) -> tuple[str, int]:
+    """Return the message and the exit status of an error; save the traceback of an unexpected one."""
     from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
     from flows.serving.server import ServerUnavailable
     from flows.step_errors import StepBadInput, StepDiverged, StepError, StepMissing

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from dg4d_lib.errors import BadInput
 from flows.commands import terminal
+from flows.commands.endings import describe
 from flows.convert import convert_job, stored
 from flows.engine.output_lock import is_up_to_date
 from flows.exit_status import exit_status_of
@@ -18,8 +19,6 @@ from flows.packages.publish import check_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from flows.packages.delivery import Outcome
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def make_each(wish: Wish, console: "Console") -> int:
     if wish.alone:
         raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
     items = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in wish.pictures])
-    failed: dict[str, Outcome] = {}
+    failed: dict[str, str] = {}  # kind of failure by item
     for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
         console.print(f"{number} of {len(items)}: {picture}", markup=False)
         try:
@@ -75,12 +74,12 @@ def make_each(wish: Wish, console: "Console") -> int:
         except Exception as error:  # must not stop the other pictures
             from flows.engine.item_runs import failure
 
-            failed[item] = failure(error)
-            console.print(f"failed: {item}: {failed[item].message}", markup=False, style="red")
+            failed[item] = failure(error).kind
+            console.print(f"failed: {item}: {describe(error)[0]}", markup=False, style="red")
     console.print(f"{len(items) - len(failed)} of {len(items)} assets are in {wish.out or Path('out')}", markup=False)
     if not failed:
         return 0
-    return exit_status_of(failed[item].kind if item in failed else "" for item in items)
+    return exit_status_of(failed.get(item, "") for item in items)
 
 
 def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:

@@ -221,14 +221,14 @@ def watch(
         looked, trouble = 0.0, ""
         with granted(watcher.folder, watcher.out):
             while True:
-                now = time.monotonic()
-                if now - looked >= RESULTS_EVERY_S:
-                    looked, lines = now, results.look()
+                if time.monotonic() - looked >= RESULTS_EVERY_S:
+                    lines = results.look()
                     with suppress(httpx.HTTPError):  # the next look asks again
                         lines += runs.look()
                     for line in lines:
                         typer.echo(line)
-                if (digest := watcher.look(now)) is not None:
+                    looked = time.monotonic()
+                if (digest := watcher.look(time.monotonic())) is not None:
                     before, trouble = trouble, ""
                     try:
                         announce(watcher.folder, watcher.inputs(), watcher.out, digest)
@@ -237,7 +237,7 @@ def watch(
                     except (httpx.TransportError, httpx.HTTPStatusError) as error:
                         if isinstance(error, httpx.HTTPStatusError) and not _is_passing(error.response.status_code):
                             raise
-                        trouble = "the server does not answer; the files are announced when it does"
+                        trouble = "the server is unavailable; the files are announced when it answers"
                         revive()
                     else:
                         watcher.told()

@@ -56,7 +56,8 @@ def list_pattern(pattern: str, out: Path) -> list[Found]:
         state = "is not a folder" if base.exists() else "does not exist"
         raise BadInput(f"the pattern {pattern!r} matches nothing: {base} {state}")
     try:
-        return _media(base, base.glob("/".join(parts[first:])), out)
+        matches = (path for path in base.glob("/".join(parts[first:])) if not path.is_dir())
+        return _media(base, matches, out)
     except ValueError as error:
         raise BadInput(f"{pattern!r} is not a pattern such as 'photos/**/*.png': {error}") from error
 
@@ -120,7 +121,7 @@ def _media(folder: Path, paths: Iterable[Path], out: Path) -> list[Found]:
     found = []
     for path in sorted(set(paths)):
         name = path.relative_to(folder)
-        linked = path.is_symlink() and path.is_dir()  # nobody follows it: without an error its files would be missed
+        linked = path.is_symlink() and path.is_dir()  # not followed: an error says that its files are left out
         is_media = path.suffix.lower() in SUFFIXES and path.is_file()
         if not (linked or is_media) or any(part[0] == "." for part in name.parts):
             continue
@@ -133,5 +134,6 @@ def _media(folder: Path, paths: Iterable[Path], out: Path) -> list[Found]:
         except BadInput as error:
             found.append(Found(name.as_posix(), path, error=str(error)))
         else:
-            found += [] if linked else [Found(name.as_posix(), place)]  # one that leads inside is listed there
+            if not linked:  # files of a linked folder that leads inside are listed at their own place
+                found.append(Found(name.as_posix(), place))
     return found

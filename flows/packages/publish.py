@@ -5,6 +5,7 @@ import filecmp
 import glob
 import hashlib
 import itertools
+import math
 import os
 import tempfile
 import time
@@ -21,7 +22,7 @@ from steps.artifacts.archives import unpack
 from steps.store.files import remove_tree, require_regular, room_for, walk
 
 HOST_DIGITS = 6  # of the machine in names of scratch folders, see `naming.LONGEST_PART_BYTES`
-FOREIGN_S = 24 * 3600.0  # without a change, after which a scratch folder of another machine is left over
+FOREIGN_S = 24 * 3600.0  # without a change; then a scratch folder of another machine counts as left over
 CANNOT_SWAP = {errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS, errno.EINVAL}
 
 Files = dict[str, dict[str, Any]]  # path within the package -> {"digest", "size_bytes"}
@@ -153,7 +154,7 @@ def leftovers(folder: Path) -> list[Path]:
     folder, left = folder.resolve(), []
     for path in sorted(p for place in (folder.parent, folder) for p in place.glob(f".{glob.escape(folder.name)}.*-*")):
         kind, _, owner = path.name.removeprefix(f".{folder.name}.").partition("-")
-        left += [path] if kind in get_args(Scratch) and _has_ended(owner, path) else []
+        left += [path] if kind in get_args(Scratch) and _is_left_over(owner, path) else []
     return left
 
 
@@ -228,12 +229,19 @@ def _publish(package: Path, folder: Path, finish: Finish, say: Say, in_place: bo
 
 
 def _host() -> str:
-    """Return a short digest of the identity of this machine: process ids of others say nothing here."""
+    """Return a short digest of the identity of this machine, since process ids are unique on one machine only."""
     return hashlib.sha256(host_id().encode()).hexdigest()[:HOST_DIGITS]
 
 
-def _has_ended(owner: str, scratch: Path) -> bool:
-    """Return true if the process that made a scratch folder, "HOST-PID", has ended; those of others end with time."""
+def _is_left_over(owner: str, scratch: Path) -> bool:
+    """Return true if a scratch folder is left over.
+
+    On this machine, its process has ended; on another one, nothing in it has changed for `FOREIGN_S`.
+
+    Args:
+        owner: end of its name, HOST-PID; earlier versions wrote the PID alone.
+        scratch: the folder.
+    """
     host, _, pid = owner.partition("-")
     if host != _host():
         return time.time() - _last_change(scratch) > FOREIGN_S
@@ -242,13 +250,13 @@ def _has_ended(owner: str, scratch: Path) -> bool:
 
 
 def _last_change(folder: Path) -> float:
-    """Return when something in a folder was changed last, in seconds since the epoch; 0 if it is gone."""
-    last = 0.0
+    """Return when something in a folder was changed last, in seconds since the epoch; infinity if it is gone."""
+    times: list[float] = []
     for path in (folder, *walk(folder)):
         with suppress(FileNotFoundError):
             status = path.lstat()
-            last = max(last, status.st_mtime, status.st_ctime)  # a rename changes the latter only
-    return last
+            times += [status.st_mtime, status.st_ctime]  # a rename changes the latter only
+    return max(times, default=math.inf)
 
 
 def _is_complete(record: dict[str, Any]) -> bool:

@@ -8,12 +8,12 @@ import sys
 
 import uvicorn
 
-from steps.runtime.process_setup import collector_resting
+from steps.runtime.process_setup import garbage_collection_paused
 
 
 def serve(listener: socket.socket) -> None:
     """Serve the application on a bound socket until the process is stopped."""
-    with collector_resting():
+    with garbage_collection_paused():
         from flows.serving.server_app import create_app  # noqa: PLC0415 - this is what takes time
 
         config = uvicorn.Config(create_app(), log_level="warning")

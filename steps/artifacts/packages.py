@@ -9,6 +9,7 @@ from dg4d_lib.assets.placement import Placement
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, RADIUS
 from dg4d_lib.errors import BadInput
 from steps.contract import Frozen
+from steps.store.files import require_regular
 
 MANIFEST = "asset.json"
 ASSET = "asset.glb"
@@ -29,6 +30,8 @@ PREVIEW = "preview.mp4"
 TURNTABLE = "turntable.mp4"
 MOVING_PICTURE = "preview.webp"
 SHEET = "contact_sheet.png"
+
+WIDEST_FOV_DEG = 179.9  # at 180 degrees, the focal length is 0
 
 ABOUT = {
     ASSET: "animated textured mesh, glTF 2.0",
@@ -78,6 +81,8 @@ class Camera(Frozen):
     fov_y_deg: float = FOV_Y_DEG
     whole_fov_y_deg: float | None = Field(
         None,
+        gt=0,
+        le=WIDEST_FOV_DEG,
         description="field of view of square pictures that hold the whole animation from all sides, at the distance of "
         "the input camera; older packages have none",
     )
@@ -90,7 +95,9 @@ class Camera(Frozen):
     def placed(cls, placement: Placement, whole_fov_y_deg: float) -> "Camera":
         """Return the camera in the coordinates of the files."""
         return cls(
-            radius=RADIUS * placement.scale, target=placement.translation, whole_fov_y_deg=round(whole_fov_y_deg, 1)
+            radius=RADIUS * placement.scale,
+            target=placement.translation,
+            whole_fov_y_deg=min(round(whole_fov_y_deg, 1), WIDEST_FOV_DEG),
         )
 
 
@@ -132,6 +139,7 @@ def read_file(folder: Path, name: str) -> bytes:
         BadInput: the file is missing or cannot be read.
     """
     try:
+        require_regular(folder / name)
         return (folder / name).read_bytes()
     except OSError as error:
         raise BadInput(f"{folder} is not complete: {name} cannot be read ({error.strerror}); make it again") from error

@@ -36,8 +36,8 @@ def prepare_process() -> None:
 
 
 @contextmanager
-def collector_resting() -> Iterator[None]:
-    """Collect no garbage in the block and never look at what it leaves: that is a quarter of the time of imports."""
+def garbage_collection_paused() -> Iterator[None]:
+    """Collect no garbage in the block, and none of its objects later: this saves a quarter of the time of imports."""
     enabled = gc.isenabled()
     gc.disable()
     try:

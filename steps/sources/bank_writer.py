@@ -27,7 +27,7 @@ def write_bank(path: Path, views_by_frame: Sequence[Sequence[KnownView]], scratc
     sheets, views = [], []
     for number, view in enumerate(views_by_frame[0]):
         name = f"{number:03d}.png"
-        write_png(scratch / name, _sheet([views[number].cutout for views in views_by_frame], rows, columns))
+        write_png(scratch / name, _sheet([frame[number].cutout for frame in views_by_frame], rows, columns))
         sheets.append((name, (scratch / name).read_bytes()))
         (scratch / name).unlink()
         camera = view.camera

@@ -50,7 +50,8 @@ class Entry(NamedTuple):
 class ArtifactStore:
     """Artifacts by content, and small files by name, in a folder.
 
-    With an object store, all methods raise StoreUnreachable if it does not answer.
+    With an object store, all methods raise StoreUnreachable if it does not answer; with a folder of another user, those
+    that need access which this user lacks raise BadInput.
 
     Args:
         root: folder, made when the first file is put.
@@ -75,7 +76,6 @@ class ArtifactStore:
 
         Raises:
             DiskFull: there is no room; the store is as it was.
-            BadInput: the store is that of another user.
         """
         with path.open("rb") as source:
             return self._put(source, media_type)
@@ -100,7 +100,8 @@ class ArtifactStore:
     def has(self, ref: ArtifactRef) -> bool:
         """Return True if the artifact is here with its full size."""
         try:
-            return self._place(ref.digest).stat().st_size == ref.size_bytes
+            with self._allowed():
+                return self._place(ref.digest).stat().st_size == ref.size_bytes
         except FileNotFoundError:
             return False
 
@@ -141,7 +142,7 @@ class ArtifactStore:
     def content_digest(self, digest: str) -> str | None:
         """Return the true digest of the bytes stored under a digest; None if there are none."""
         try:
-            with self._place(digest).open("rb") as file:
+            with self._allowed(), self._place(digest).open("rb") as file:
                 return _digest(file)
         except FileNotFoundError:
             return None
@@ -159,7 +160,8 @@ class ArtifactStore:
     def read(self, name: str) -> bytes | None:
         """Return the content of a small file; None if there is none."""
         try:
-            return (self.root / name).read_bytes()
+            with self._allowed():
+                return (self.root / name).read_bytes()
         except FileNotFoundError:
             return None
 
@@ -178,9 +180,8 @@ class ArtifactStore:
         Raises:
             DiskFull: there is no room; no file is left.
         """
-        with self._allowed():
+        with room_for(self.root), self._allowed():
             path = self._new_file(name)
-        with room_for(path.parent):
             try:
                 file = path.open("x", encoding="utf-8")
             except FileExistsError:
@@ -195,8 +196,9 @@ class ArtifactStore:
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove files by name; those that are gone already are ignored."""
-        for name in names:
-            (self.root / name).unlink(missing_ok=True)
+        with self._allowed():
+            for name in names:
+                (self.root / name).unlink(missing_ok=True)
 
     def tidy(self, unused_s: float) -> None:
         """Remove partial files of killed processes that nobody has used for so many seconds."""

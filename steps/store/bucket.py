@@ -75,8 +75,8 @@ class BucketStore(ArtifactStore):
     def content_digest(self, digest: str) -> str | None:
         """Return the true digest of the bytes stored under a digest; None if there are none."""
         try:
-            with self._answering(), Path(os.devnull).open("wb") as nowhere:
-                return copy_hashed(self._reader(digest), nowhere)[0]
+            with self._answering():
+                return copy_hashed(self._reader(digest))[0]
         except FileNotFoundError:
             return None
 

@@ -10,7 +10,7 @@ import torch
 print(threading.active_count(), torch.cuda.is_initialized(), "pymeshlab" in sys.modules, "torch" in sys.modules)
 before = set(sys.modules)
 import numba
-from dg4d_lib.fitting.adam import Adam
+from dg4d_lib.adam import Adam
 value = torch.zeros(1, requires_grad=True)
 adam = Adam([{"params": value, "lr": 0.1}])
 value.sum().backward()

@@ -19,6 +19,7 @@ from dg4d_lib.assets import resample
 from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.glb import read_glb
 from dg4d_lib.assets.formats.splats import read_splats
+from dg4d_lib.assets.placement import Placement
 from dg4d_lib.cameras.orbit import FOV_Y_DEG
 from dg4d_lib.cameras.viewpoints import whole_fov_y_deg
 from dg4d_lib.errors import BadInput
@@ -31,7 +32,7 @@ from steps import pack_asset
 from steps.artifacts.archives import EPOCH
 from steps.artifacts.media import read_png
 from steps.artifacts.meshes import write_tracked
-from steps.artifacts.packages import PackagePlacement, read_manifest
+from steps.artifacts.packages import WIDEST_FOV_DEG, Camera, PackagePlacement, read_manifest
 from steps.artifacts.rendering import read_states, read_surface
 from steps.pack_asset import run
 
@@ -238,6 +239,10 @@ def test_the_manifest_says_which_field_of_view_holds_the_whole_animation(package
         archive.extract("asset.json", tmp_path)
     expected = whole_fov_y_deg((large.means + torch.tensor([REACH, 0, 0]))[None])
     assert FOV_Y_DEG < read_manifest(tmp_path).camera.whole_fov_y_deg == pytest.approx(expected, abs=0.05)
+
+
+def test_the_widest_field_of_view_is_below_180_degrees() -> None:
+    assert Camera.placed(Placement(), 179.99).whole_fov_y_deg == WIDEST_FOV_DEG < 180
 
 
 def test_the_manifest_leads_back_to_the_fit(package: Path, tmp_path: Path) -> None:

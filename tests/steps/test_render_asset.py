@@ -1,6 +1,7 @@
 """Pictures of a package: right side, right moment, straight alpha, clear refusals."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from shutil import copytree, rmtree
@@ -133,6 +134,20 @@ def test_a_package_that_does_not_know_its_extent_is_not_fitted(package: Path, tm
     with pytest.raises(BadInput, match="older dg4d made it"):
         render(older, tmp_path / "out", fit=True)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("angle", [0.0, -5.0, 180.0, float("nan")])
+def test_a_field_of_view_out_of_range_is_refused(package: Path, tmp_path: Path, angle: float) -> None:
+    with pytest.raises(BadInput, match=r"camera.whole_fov_y_deg: Input should be"):
+        render(enlarged(package, tmp_path / "bent", whole_fov_y_deg=angle), tmp_path / "out", fit=True)
+
+
+def test_a_pipe_in_place_of_the_mesh_is_refused(package: Path, tmp_path: Path) -> None:
+    piped = copytree(package, tmp_path / "piped")
+    (piped / "asset.glb").unlink()
+    os.mkfifo(piped / "asset.glb")
+    with pytest.raises(BadInput, match=r"asset.glb cannot be read \(not a regular file\)"):
+        render(piped, tmp_path / "out", mesh=True)
 
 
 def test_without_splats_the_fitted_motion_is_drawn(package: Path, tmp_path: Path) -> None:

@@ -70,9 +70,28 @@ def test_the_store_of_another_user_is_refused(
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
         return real(path, mode, **options)
 
+    real_stat = Path.stat
+
+    def hidden(path: Path, **options: Any) -> os.stat_result:
+        if path == kept:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return real_stat(path, **options)
+
+    def fixed(path: Path, **_: Any) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    kept = store.path(ref)
     monkeypatch.setattr(Path, "open", closed)
+    monkeypatch.setattr(Path, "unlink", fixed)
     monkeypatch.setattr(Path, "owner", lambda _: "ana")
+    with monkeypatch.context() as private, pytest.raises(BadInput, match="belongs to the user ana"):
+        private.setattr(Path, "stat", hidden)
+        store.has(ref)
     for use in (
+        lambda: store.content_digest(ref.digest),
+        lambda: store.read("records/a"),
+        lambda: store.create("records/b", "1"),
+        lambda: store.remove(["records/a"]),
         lambda: store.path(ref),
         lambda: store.get(ref, tmp_path / "b"),
         lambda: store.put_bytes(b"precious", "a/b"),

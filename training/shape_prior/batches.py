@@ -3,7 +3,7 @@
 import os
 import signal
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
@@ -95,11 +95,11 @@ def join_samples(samples: list[Sample], rays: int, generator: np.random.Generato
     )
 
 
-def batches(seed: int, first: int, count: int, size: int, rays: int, workers: int) -> Iterator[Batch]:
+def batches(seed: int, first: int, count: int, size: int, rays: int, workers: int) -> Generator[Batch, None, None]:
     """Yield batches `first` to `first + count - 1`, made by worker processes, or here if there are none.
 
     Raises:
-        BrokenProcessPool: a worker was killed; the others are ended, too.
+        BrokenProcessPool: a worker was killed; the others are ended, too, as when the iterator is closed.
     """
     numbers = iter(range(first, first + count))
     if not workers:
@@ -115,7 +115,7 @@ def batches(seed: int, first: int, count: int, size: int, rays: int, workers: in
                     yield _unpacked(waiting.popleft().result())
             while waiting:
                 yield _unpacked(waiting.popleft().result())
-        except BrokenProcessPool:
+        except (BrokenProcessPool, GeneratorExit):
             for worker in set(active_children()) - others:
                 worker.kill()  # the executor sends SIGTERM, which workers ignore, and would wait for them
             raise

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from dg4d_lib.errors import FitDiverged
 from dg4d_lib.shape_prior.frustum import KNOTS
-from dg4d_lib.shape_prior.network import ShapePriorNetwork
+from dg4d_lib.shape_prior.network import ShapePriorNetwork, not_finite
 from training.shape_prior.batches import Batch
 
 COLOR_WEIGHT = 0.1
@@ -88,8 +88,8 @@ def validation_figures(network: ShapePriorNetwork, held_out: list[Batch]) -> dic
         families += batch.families
         color.append((color_at(knots[batch.ray], batch.depth) - batch.color.float() / 255).abs().mean().item())
         moment, _, _ = network.mirror(features.code)
-        if not moment.isfinite().all():
-            raise FitDiverged(f"the output on held-out samples is not finite; {LOWER_LR}")
+        if broken := not_finite({"occupancy": logits, "colors": knots, "mirror plane": moment}):
+            raise FitDiverged(f"the {broken[0]} that the network gives for a held-out sample is not finite; {LOWER_LR}")
         normal = torch.linalg.eigh(moment.double())[1][:, :, -1]
         known = batch.plane[:, :3].abs().amax(1) > 0
         cosine = (normal * batch.plane[:, :3]).sum(1)[known].abs().clamp(max=1)

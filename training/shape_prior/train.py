@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -40,6 +41,7 @@ from training.shape_prior.curves import draw_curves
 from training.shape_prior.losses import LOWER_LR, training_losses, validation_figures
 from training.shape_prior.muon import Muon
 
+UNREADABLE = (OSError, EOFError, AttributeError, LookupError, TypeError, ValueError, RuntimeError, UnpicklingError)
 VALIDATION_SEED = 1_000_003  # no training run uses it
 CPU = torch.device("cpu")
 CHECKPOINT, WEIGHTS, CURVES = "checkpoint.pt", "network.safetensors", "curves"
@@ -119,8 +121,8 @@ class Run:
             FitDiverged: the gradient of the last step or a weight is not finite.
         """
         shipped = {name: value.half() for name, value in self.average.state_dict().items()}
-        broken = not_finite({"the gradient norm": self.gradient_norm, **self.network.state_dict(), **shipped})
-        if broken:
+        own = {"the gradient norm": self.gradient_norm, **self.network.state_dict()}
+        if broken := not_finite(own) + not_finite(shipped):
             raise FitDiverged(
                 f"{broken[0]} is not finite after {self.shown} of {self.plan.samples} samples (--lr "
                 f"{self.plan.lr:g}); {LOWER_LR}"
@@ -154,13 +156,17 @@ class Run:
         Raises:
             BadInput: the checkpoint cannot be read, or holds weights that are not finite.
         """
-        state = _read_checkpoint(folder / CHECKPOINT)
-        run = cls(Plan(**state["plan"]), _config(state["config"]), device)
-        run.network.load_state_dict(state["network"])
-        run.average.load_state_dict(state["average"])
-        for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(value)
-        run.shown, run.curve = state["shown"], state["curve"]
+        path = folder / CHECKPOINT
+        state = _read_checkpoint(path)
+        with _checkpoint_errors(path):
+            plan, config = Plan(**state["plan"]), _config(state["config"])
+        run = cls(plan, config, device)
+        with _checkpoint_errors(path):
+            run.network.load_state_dict(state["network"])
+            run.average.load_state_dict(state["average"])
+            for optimizer, value in zip(run.optimizers, state["optimizers"], strict=True):
+                optimizer.load_state_dict(value)
+            run.shown, run.curve = state["shown"], state["curve"]
         return run
 
     def warm_start(self, path: Path) -> list[str]:
@@ -395,21 +401,28 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         BadInput: the file is no checkpoint of a run, or its weights are not finite.
     """
-    try:
-        state = torch.load(path, weights_only=True, map_location=CPU)
-        broken = not_finite({**state["network"], **state["average"]})
-    except (OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError, UnpicklingError) as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise BadInput(
-            f"{path} cannot be read as a checkpoint of this trainer: {reason}; give another file or, in the "
-            "folder of a run, remove it to begin a new one"
-        ) from error
+    with _checkpoint_errors(path):
+        state: dict[str, Any] = dict(torch.load(path, weights_only=True, map_location=CPU))
+        broken = not_finite(state["network"]) + not_finite(state["average"])
     if broken:
         raise BadInput(
             f"{path} is of a run that diverged: {broken[0]} has values that are not finite; begin a new run with a "
             "lower --lr in another folder"
         )
-    return dict(state)
+    return state
+
+
+@contextmanager
+def _checkpoint_errors(path: Path) -> Iterator[None]:
+    """Turn errors of a file that is no checkpoint of a run into BadInput."""
+    try:
+        yield
+    except UNREADABLE as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise BadInput(
+            f"{path} cannot be read as a checkpoint of this trainer: {reason}; give another file or, in the "
+            "folder of a run, remove it to begin a new one"
+        ) from error
 
 
 def _on_cpu(value: Any) -> Any:

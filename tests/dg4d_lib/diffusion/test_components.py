@@ -172,6 +172,15 @@ def test_a_linear_layer_is_read_from_either_format(suffix: str, tmp_path: Path) 
         components.read_linear(tmp_path, "other", FP32)
 
 
+@pytest.mark.parametrize(("content", "named"), [({"a": 1}, "'a'"), ({3: torch.ones(2)}, "3")])
+def test_a_pickle_of_more_than_named_tensors_is_refused(
+    content: dict[object, object], named: str, tmp_path: Path
+) -> None:
+    torch.save({"weight": torch.ones(2), **content}, tmp_path / "lora.bin")
+    with pytest.raises(BadInput, match=rf"lora\.bin is no file of named tensors: {named} is none"):
+        components.read_tensors(tmp_path / "lora.bin")
+
+
 @pytest.mark.parametrize("steps", [*range(1, 41), 142, 143, 166, 334, 400, 500, 900, 999])
 def test_a_sampler_starts_near_pure_noise_whatever_its_number_of_steps(steps: int) -> None:
     timesteps = noise_schedule.ddim_timesteps(steps)

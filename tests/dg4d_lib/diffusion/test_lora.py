@@ -113,9 +113,26 @@ def test_tensors_that_a_merge_would_drop_are_refused(key: str, tmp_path: Path) -
     tensors = {"block.to_q.lora_A.weight": DOWN, "block.to_q.lora_B.weight": UP, key: torch.ones(2)}
     save_file(tensors, tmp_path / "lora.safetensors")
     made = network()
-    with pytest.raises(BadInput, match=rf"is more than a LoRA: {re.escape(key)} \(1 such tensors\) cannot be merged"):
+    with pytest.raises(BadInput, match=rf"is more than a LoRA: '{re.escape(key)}' \(1 such tensors\) cannot be merged"):
         merge_lora(made, tmp_path, 1.0)
     assert not made["block"]["to_q"].weight.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.float8_e5m2, torch.float16, torch.int32])
+def test_factors_of_any_precision_are_merged(dtype: torch.dtype, tmp_path: Path) -> None:
+    tensors = {"block.to_q.lora_A.weight": DOWN, "block.to_q.lora_B.weight": UP}
+    save_file({name: tensor.to(dtype) for name, tensor in tensors.items()}, tmp_path / "lora.safetensors")
+    made = network()
+    merge_lora(made, tmp_path, 1.0)
+    assert torch.equal(made["block"]["to_q"].weight, UP @ DOWN)
+
+
+@pytest.mark.parametrize("shape", [(2,), (0,)])
+def test_an_alpha_that_is_not_one_number_is_refused(shape: tuple[int], tmp_path: Path) -> None:
+    tensors = {"q.lora_down.weight": DOWN, "q.lora_up.weight": UP, "q.alpha": torch.ones(shape)}
+    save_file(tensors, tmp_path / "lora.safetensors")
+    with pytest.raises(BadInput, match=r"is more than a LoRA: 'q\.alpha' \(1 such tensors\) cannot be merged"):
+        merge_lora(network(), tmp_path, 1.0)
 
 
 def test_dora_in_the_metadata_is_refused(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def test_an_item_of_several_has_the_exit_status_that_its_error_has_alone() -> No
     assert TooLarge in of_ours(DG4DError)
     for kind in {*of_ours(DG4DError), *of_ours(StepError), ServerUnavailable} - {ItemFailed}:
         error = kind("fit", "why") if issubclass(kind, StepError) else kind.__new__(kind, "why")
-        assert endings._describe(error)[1] == EXIT_STATUS.get(kind.__name__, EXIT_FAILED), kind
+        assert endings.describe(error)[1] == EXIT_STATUS.get(kind.__name__, EXIT_FAILED), kind
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_read_only_folder_is_told_with_the_variable_that_names_it(
     monkeypatch.setenv("DG4D_HOME", "/here/home")
     monkeypatch.setenv("DG4D_STORE", "/here/home/store")
     error = OSError(errno.EROFS, "Read-only file system", path)
-    assert endings._describe(error) == (f"Read-only file system: {path}; {advice}", EXIT_BAD_INPUT)
+    assert endings.describe(error) == (f"Read-only file system: {path}; {advice}", EXIT_BAD_INPUT)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_a_home_that_is_no_folder_is_told(
     monkeypatch.setenv("DG4D_HOME", str(tmp_path / home))
     with pytest.raises(OSError, match="Errno") as raised:
         make_private(tmp_path / home)
-    text, status = endings._describe(raised.value)
+    text, status = endings.describe(raised.value)
     assert text.startswith(f"$DG4D_HOME {state}") and f": {tmp_path / home}; name a folder" in text
     assert status == EXIT_BAD_INPUT
 

@@ -47,7 +47,7 @@ def test_an_unexpected_error_of_a_picture_does_not_stop_the_others(dg4d: Run, mo
 
     monkeypatch.setattr(make, "check_folder", check_folder)
     done = dg4d("make", *(words(f"{name}.png", name) for name in "abc"), "-o", "all")
-    assert done.exit_code == 1 and "failed: b: RuntimeError: nobody thought of this" in done.stdout
+    assert done.exit_code == 1 and "failed: b: internal error (RuntimeError: nobody thought of this)" in done.stdout
     assert "2 of 3 assets are in all" in done.stdout
 
 

@@ -201,7 +201,7 @@ def test_a_watch_goes_on_while_the_server_is_away(
         services.watch(inbox, inbox.parent / "out", 0.0)
     digest = happened[0]
     assert happened == [digest, "revived", digest, "revived", digest, "revived", digest]
-    assert capsys.readouterr().err.count("the server does not answer") == 1
+    assert capsys.readouterr().err.count("the server is unavailable") == 1
 
 
 def test_a_watch_ends_when_the_server_refuses_its_events(
@@ -210,7 +210,7 @@ def test_a_watch_ends_when_the_server_refuses_its_events(
     monkeypatch.setattr(watching, "announce", lambda *_: (_ for _ in ()).throw(answer(403)))
     with pytest.raises(typer.Exit):
         services.watch(inbox, inbox.parent / "out", 0.0)
-    assert "does not answer" not in capsys.readouterr().err
+    assert "is unavailable" not in capsys.readouterr().err
 
 
 def test_a_watch_announces_a_manifest_and_waits_while_there_are_several(
@@ -235,6 +235,26 @@ def test_a_watch_announces_a_manifest_and_waits_while_there_are_several(
         services.watch(inbox, inbox.parent / "out", 0.0)
     assert announced == [inbox / "a.csv"]
     assert capsys.readouterr().err.count("several manifests (a.csv, b.csv)") == 1
+
+
+def test_a_slow_server_does_not_count_as_rest(inbox: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, looks = [0.0], list[float]()
+
+    def failed_runs(_: watching.FailedRuns) -> list[FlowRun]:
+        clock[0] += 60.0
+        return []
+
+    def look(_: watching.Watcher, now: float) -> None:
+        looks.append(now)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(services.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(services, "RESULTS_EVERY_S", 0.0)
+    monkeypatch.setattr(watching.FailedRuns, "_failed", failed_runs)
+    monkeypatch.setattr(watching.Watcher, "look", look)
+    with pytest.raises(typer.Exit):
+        services.watch(inbox, inbox.parent / "out", 10.0)
+    assert looks == clock
 
 
 def test_a_watch_prints_failed_runs(

@@ -266,6 +266,12 @@ def test_a_linked_folder_that_leads_out_of_a_folder_is_a_bad_item(tmp_path: Path
     assert "the folder 'elsewhere' leads out of the folder" in found[-1].error and "copy" in found[-1].error
 
 
+def test_a_pattern_leaves_out_folders_that_it_matches_and_linked_ones(tmp_path: Path) -> None:
+    touch(tmp_path, "outside/b.png", "in/a.png", "in/deep/c.png")
+    (tmp_path / "in" / "elsewhere").symlink_to(tmp_path / "outside")
+    assert [(item.name, item.error) for item in items(f"{tmp_path}/in/*", str(tmp_path / "out"))] == [("a", "")]
+
+
 def test_a_pattern_gives_what_it_matches_named_from_its_first_plain_folder(tmp_path: Path) -> None:
     touch(tmp_path, "in/a.png", "in/deep/b.png", "in/deep/c.jpg", "in/.d.png", "in/out/e.png", "f.png")
     found = items(f"{tmp_path}/in/**/*.png", f"{tmp_path}/in/out")

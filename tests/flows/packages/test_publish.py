@@ -235,6 +235,21 @@ def test_what_another_machine_writes_stays_until_it_has_not_changed_for_a_day(
     assert not foreign.exists()
 
 
+def test_a_scratch_folder_that_another_machine_removes_meanwhile_is_not_left_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / ".out.outgoing-another-1").mkdir()
+    real = Path.lstat
+
+    def lstat(path: Path) -> os.stat_result:
+        if ".outgoing-" in path.name:
+            raise FileNotFoundError(path)
+        return real(path)
+
+    monkeypatch.setattr(Path, "lstat", lstat)
+    assert leftovers(tmp_path / "out") == []
+
+
 def test_a_pipe_is_no_package_and_has_no_digest(package: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     publish(package, out, finish)

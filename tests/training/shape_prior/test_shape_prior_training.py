@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,11 +140,18 @@ def test_a_gradient_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_network_whose_output_is_not_finite_is_not_validated() -> None:
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [
+        ("plane", "the mirror plane that the network gives for a held-out sample is not finite"),
+        ("head", "the occupancy that the network gives for a held-out sample is not finite"),
+    ],
+)
+def test_a_network_whose_output_is_not_finite_is_not_validated(layer: str, message: str) -> None:
     network = training.Run(plan(12), TINY).average
     with torch.no_grad():
-        network.plane.bias[0] = torch.inf
-    with pytest.raises(FitDiverged, match="the output on held-out samples is not finite"):
+        network.get_parameter(f"{layer}.bias")[0] = torch.inf
+    with pytest.raises(FitDiverged, match=message):
         validation_figures(network, [make_batch(1, 0, 1, 16)])
 
 
@@ -153,20 +161,47 @@ def test_a_run_without_held_out_samples_has_no_validation_figures(tmp_path: Path
     assert set(row) == {"shown", "rate", *(f"train_{name}" for name in Losses.__dataclass_fields__)}
 
 
-def broken_checkpoint(path: Path) -> Path:
-    """A checkpoint of a run that diverged, as earlier versions wrote it."""
-    training.Run(plan(32), TINY).save(path.parent)
-    state = torch.load(path.parent / training.CHECKPOINT, weights_only=True)
-    state["average"]["stem.bias"][0] = torch.nan
-    torch.save(state, path)
-    return path
+@pytest.mark.parametrize("part", ["network", "average"])
+def test_weights_of_a_run_that_are_not_finite_are_not_saved(part: str, tmp_path: Path) -> None:
+    run = training.Run(plan(12), TINY)
+    with torch.no_grad():
+        getattr(run, part).stem.bias[0] = torch.inf
+    with pytest.raises(FitDiverged, match=r"stem\.bias is not finite"):
+        run.save(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_checkpoint_that_is_not_finite_is_refused(tmp_path: Path) -> None:
-    path = broken_checkpoint(tmp_path / training.CHECKPOINT)
+def changed_checkpoint(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Write the checkpoint of a new run, with a change in it."""
+    training.Run(plan(32), TINY).save(folder)
+    state = torch.load(folder / training.CHECKPOINT, weights_only=True)
+    change(state)
+    torch.save(state, folder / training.CHECKPOINT)
+    return folder / training.CHECKPOINT
+
+
+@pytest.mark.parametrize("part", ["network", "average"])
+def test_a_checkpoint_that_is_not_finite_is_refused(part: str, tmp_path: Path) -> None:
+    path = changed_checkpoint(tmp_path, lambda state: state[part]["stem.bias"].fill_(torch.nan))
     for read in (lambda: training.Run.load(tmp_path), lambda: training.Run(plan(32), TINY).warm_start(path)):
         with pytest.raises(BadInput, match=r"is of a run that diverged: stem\.bias has values that are not finite"):
             read()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: state.pop("plan"),
+        lambda state: state["plan"].update(rank=4),
+        lambda state: state["network"].pop("stem.bias"),
+        lambda state: state["average"].update({"stem.bias": 3}),
+        lambda state: state["optimizers"].pop(),
+    ],
+)
+def test_a_checkpoint_of_another_version_is_named(change: Callable[[dict[str, Any]], object], tmp_path: Path) -> None:
+    path = changed_checkpoint(tmp_path, change)
+    with pytest.raises(BadInput, match=rf"{path} cannot be read as a checkpoint of this trainer: \w+: "):
+        training.Run.load(tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore:.*is a no-op:UserWarning")
@@ -298,6 +333,17 @@ def test_no_worker_is_left_when_one_is_killed() -> None:
     killed.kill()
     with pytest.raises(BrokenProcessPool):
         list(made)
+    assert not other.is_alive()
+
+
+@pytest.mark.slow
+def test_batches_can_be_closed_after_a_worker_was_killed() -> None:
+    made = batches(1, 0, 1000, 1, 16, workers=2)
+    next(made)
+    killed, other = active_children()
+    killed.kill()
+    killed.join()
+    made.close()
     assert not other.is_alive()
 
 

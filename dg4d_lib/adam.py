@@ -11,8 +11,8 @@ class Adam:
     """The part of `torch.optim.Adam` that the fits use, with the results of its `fused=True`.
 
     Attributes:
-        param_groups: tensors ("params", of one device and precision per group) and their learning rate ("lr"); both may
-            be replaced between steps.
+        param_groups: tensors ("params", of one device and precision per group), their learning rate ("lr") and "eps";
+            all may be replaced between steps.
         state: number of steps ("step") and moments ("exp_avg", "exp_avg_sq") of every tensor that had a gradient.
     """
 
@@ -24,14 +24,14 @@ class Adam:
         Args:
             groups: like `param_groups`; "params" may also be a single tensor.
             betas: decay rates of the moments.
-            eps: added to the root of the second moment.
+            eps: added to the root of the second moment, in groups without their own.
         """
         self.param_groups: list[dict[str, Any]] = [
-            {**group, "params": [given] if isinstance(given := group["params"], Tensor) else list(given)}
+            {"eps": eps, **group, "params": [given] if isinstance(given := group["params"], Tensor) else list(given)}
             for group in groups
         ]
         self.state: dict[Tensor, dict[str, Tensor]] = {}
-        self._betas, self._eps = betas, eps
+        self._betas = betas
 
     def zero_grad(self) -> None:
         """Remove the gradients."""
@@ -60,7 +60,7 @@ class Adam:
                 beta1=self._betas[0],
                 beta2=self._betas[1],
                 weight_decay=0.0,
-                eps=self._eps,
+                eps=group["eps"],
                 amsgrad=False,
                 maximize=False,
             )
