@@ -379,9 +379,7 @@ class MotionSettings(FitSettings):
         description="with pictures of other sides at the first frame, and a prior without weights: move their surface "
         "as the video shows it; later frames are guided by the mean of its renders and of the other guess (ours)",
     )
-    trackings: Literal[1, 3] = Field(
-        3, description="ways to track that surface; 1: faster by a minute or two (ours)"
-    )
+    trackings: Literal[1, 3] = Field(3, description="ways to track that surface; 1: faster by a minute or two (ours)")
     fine_tune: bool = Field(False, description="optimize the canonical Gaussians too (paper: no; public code: yes)")
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")
     means_lr_end: Positive = Field(

@@ -21,6 +21,7 @@ from steps.runtime.job import Job, StepReport
 STRAYS = "Gaussians that tore away from the moving subject and were dropped: {}."
 FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
 PICTURE_FRAMES = 6
+STATES = 16  # at once in the memory, where strays are searched
 FRONT_DEG, SIDE_DEG = 0.0, 90.0
 
 
@@ -81,9 +82,9 @@ def _without_strays(
     gaussians: Gaussians, deformation: AnyDeformation, frames: int
 ) -> tuple[Gaussians, AnyDeformation, int]:
     """Drop Gaussians that tear away from the subject; return the others, their deformation, and the number dropped."""
+    times = torch.split(torch.linspace(0, 1, frames), STATES)
     with torch.no_grad():
-        states = deformation.displace(gaussians.means, torch.linspace(0, 1, frames)).apply(gaussians)
-    kept = ~find_strays(states)
+        kept = ~find_strays(deformation.displace(gaussians.means, some).apply(gaussians) for some in times)
     if kept.all():
         return gaussians, deformation, 0
     return gaussians.subset(kept), deformation_of_subset(deformation, kept), int((~kept).sum())

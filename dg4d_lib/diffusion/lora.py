@@ -112,6 +112,9 @@ def _read_factors(file: Path) -> dict[str, _Factors]:
     # torch has no isfinite for float8
     if broken := sorted(key for key, tensor in tensors.items() if not tensor.float().isfinite().all()):
         raise BadInput(f"{file} is damaged: {broken[0]} has values that are not finite; download or train it again")
+    factor_count = sum(FACTOR.match(key) is not None for key in tensors)
+    if factor_count != 2 * len({_layer_name(name) for name in down}):
+        raise BadInput(f"{file} holds several factors of one layer, in several spellings; save one LoRA per file")
     return {
         _layer_name(name): _Factors(down[name], up[name], _scaling(tensors, adapter, name, down[name].shape[0]))
         for name in down

@@ -1,5 +1,7 @@
 """Gaussians that tear away from the subject while it moves, and float beside it as specks."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,22 +20,22 @@ NEIGHBORS = 16  # of a Gaussian that it may belong to; more than `FEW`
 MOST = 0.01  # share of strays; where more come off, the cloud is sparse, or the subject falls to pieces
 
 
-def find_strays(states: Gaussians) -> Bool[Tensor, " n"]:
+def find_strays(states: Iterable[Gaussians]) -> Bool[Tensor, " n"]:
     """Find Gaussians that are apart from all but a few others at some frames, though not at all of them.
 
     What is apart at every frame is a piece of the subject, however small.
 
     Args:
-        states: Gaussians at every frame, world units.
+        states: Gaussians of the first frames, of the next ones, and so on, as many as memory holds; world units.
 
     Returns:
         True for strays; none are found if they were more than a hundredth of the cloud.
     """
-    if len(states) < FEW:
-        return torch.zeros(len(states), dtype=torch.bool)
-    extents = EXTENT * states.log_scales.exp().amax(-1)
-    apart = np.stack([_are_apart(*frame) for frame in zip(states.means, extents, strict=True)])
-    strays: Bool[Tensor, " n"] = torch.from_numpy(apart.any(0) & ~apart.all(0))
+    apart = []
+    for some in states:
+        extents = EXTENT * some.log_scales.exp().amax(-1)
+        apart += [_are_apart(*frame) for frame in zip(some.means, extents, strict=True)]
+    strays: Bool[Tensor, " n"] = torch.from_numpy(np.any(apart, 0) & ~np.all(apart, 0))
     return strays if int(strays.sum()) <= MOST * len(strays) else torch.zeros_like(strays)
 
 

@@ -155,3 +155,12 @@ def test_numbers_that_are_not_finite_are_refused(broken: str, tmp_path: Path) ->
 def test_a_folder_without_one_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="has 0 files of tensors"):
         merge_lora(network(), tmp_path, 1.0)
+
+
+@pytest.mark.parametrize("other", ["block.to_q.lora_{}.weight", "transformer.block.to_q.lora_{}.default.weight"])
+def test_a_layer_that_is_named_twice_is_refused(other: str, tmp_path: Path) -> None:
+    spellings = ("transformer.block.to_q.lora_{}.weight", other)
+    tensors = {name.format(end): factor.clone() for name in spellings for end, factor in (("A", DOWN), ("B", UP))}
+    save_file(tensors, tmp_path / "lora.safetensors")
+    with pytest.raises(BadInput, match="several factors of one layer"):
+        merge_lora(network(), tmp_path, 1.0)

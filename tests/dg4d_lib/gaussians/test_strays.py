@@ -35,7 +35,8 @@ def test_what_tears_away_at_one_frame_is_a_stray(body: Tensor) -> None:
     torn[2, 7] += torch.tensor([0.0, 1.0, 0.0])
     torn[3, 11:13] += torch.tensor([0.0, 1.0, 0.0])  # two that stay together
     torn[3, 12] = torn[3, 11] + 0.01
-    assert find_strays(states(torn)).nonzero()[:, 0].tolist() == [7, 11, 12]
+    assert find_strays([states(torn)]).nonzero()[:, 0].tolist() == [7, 11, 12]
+    assert find_strays([states(torn[:3]), states(torn[3:])]).nonzero()[:, 0].tolist() == [7, 11, 12]
 
 
 def test_pieces_of_the_subject_stay_however_small(body: Tensor) -> None:
@@ -43,17 +44,17 @@ def test_pieces_of_the_subject_stay_however_small(body: Tensor) -> None:
     arm = torch.stack([torch.linspace(0.3, 0.9, 12), torch.zeros(12), torch.zeros(12)], -1).expand(FRAMES, -1, -1)
     apart = body.clone()
     apart[1:, body[0, :, 1] > 0.1] += torch.tensor([0.0, 1.0, 0.0])  # a lid is taken off
-    assert not find_strays(states(torch.cat([apart, ball, arm], 1))).any()
+    assert not find_strays([states(torch.cat([apart, ball, arm], 1))]).any()
 
 
 def test_large_gaussians_reach_farther(body: Tensor) -> None:
     torn = body.clone()
     torn[2, 7] = body[2, body[2, :, 1].argmax()] + torch.tensor([0.0, 0.15, 0.0])
-    assert find_strays(states(torn)).sum() == 1
-    assert not find_strays(states(torn, scale=0.03)).any()
+    assert find_strays([states(torn)]).sum() == 1
+    assert not find_strays([states(torn, scale=0.03)]).any()
 
 
 @pytest.mark.parametrize("count", [1, 4, 40])
 def test_a_sparse_cloud_is_kept(count: int) -> None:
     paths = torch.randn(FRAMES, count, 3, generator=torch.Generator().manual_seed(0))
-    assert find_strays(states(paths)).tolist() == [False] * count
+    assert find_strays([states(paths)]).tolist() == [False] * count
