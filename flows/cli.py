@@ -111,7 +111,11 @@ def make(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", metavar="DIR", help="output folder; of several pictures: DIR/NAME  [default: out/NAME]"
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="output folder; of several pictures: DIR/NAME; equal names get the suffix and a number: "
+            "DIR/newt-png-2  [default: out/NAME]",
         ),
     ] = None,
     bank: Annotated[
@@ -135,7 +139,9 @@ def make(
         ),
     ] = None,
     commercial_only: Commercial = False,
-    force: Annotated[bool, typer.Option("--force", help="replace another asset in the output folder")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="replace an asset of another name in the output folder")
+    ] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
 ) -> None:
     """Make an animated asset of each picture.
@@ -369,17 +375,25 @@ def render(
                 raise ValueError
         except ValueError:
             raise typer.BadParameter(f"{azimuths!r} is not a list of degrees such as 0,-75,15") from None
+        from flows.inputs.package_record import check_is_folder
         from flows.packages.publish import check_writable
 
+        check_is_folder(package)
         check_writable(out)
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        from steps.artifacts.packages import read_manifest
         from steps.artifacts.rendering import render_package
 
         views, cropped = render_package(package, angles, elevation, size, frames, mesh, out, fit=fit)
         for folder in views:
             typer.echo(folder)
         if cropped and not fit:
-            typer.echo(f"pictures in which the asset touches the edge: {cropped}; --fit shows all of it", err=True)
+            advice = (
+                "--fit shows all of it"
+                if read_manifest(package).camera.whole_fov_y_deg is not None
+                else "make the asset again with this dg4d, then --fit shows all of it"
+            )
+            typer.echo(f"pictures in which the asset touches the edge: {cropped}; {advice}", err=True)
 
 
 @app.command()

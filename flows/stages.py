@@ -1,6 +1,8 @@
 """Stages of a conversion: order of the steps and their data flow, for tasks of any engine."""
 
+import shlex
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple, ParamSpec, Protocol, TypeVar
 
 from flows import home, step_calls
@@ -8,6 +10,7 @@ from flows.engine import resources
 from flows.engine.frames import count_frames, divide_frames
 from flows.engine.requests import Conversion
 from flows.inputs.conversion_job import ConversionJob
+from flows.inputs.sources import ALWAYS_MOVING
 from flows.packages.flow_result import StepRun, notes_of
 from flows.step_calls import Asset, DrivingVideo, Gaussians, KnownViews, Mesh, Motion, Package, Plan, Subject, Verdict
 from flows.step_errors import StepBadInput
@@ -113,8 +116,18 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
     source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
     subject = tasks.prepare_subject(source, conversion, job.mask, job.depth, job.layers)
     if must_move and subject.footage is None:
-        raise StepBadInput("prepare_subject", "this is a single picture, not a video: a video has two frames or more")
+        raise StepBadInput("prepare_subject", _is_no_video(job.source_name))
     return animate(subject, source, job, conversion, tasks)
+
+
+def _is_no_video(name: str) -> str:
+    """Return the message for a single picture, by its file name, where a video was asked for."""
+    if Path(name).suffix.lower() in ALWAYS_MOVING:
+        return "this video holds a single picture, and a video has two frames or more; give a longer one"
+    return (
+        "--video: this is a single picture, and a video has two frames or more; for a generated motion run "
+        f"`dg4d make {shlex.quote(name)}`"
+    )
 
 
 def animate(

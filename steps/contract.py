@@ -4,6 +4,8 @@ import hashlib
 import importlib
 import json
 import re
+from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
@@ -36,7 +38,12 @@ RUN_ONLY = frozenset(  # fields of a record that its digest leaves out
     ["started", "duration_s", "cpu_s", "peak_memory_mb", "flops", "run_notes", "machine"]
 )
 
-NO_LIST = {"list_type", "tuple_type"}  # errors of pydantic
+NO_LIST = {"list_type", "tuple_type"}  # errors of pydantic, as the next ones
+NO_NUMBER = {
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "is no whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "is no number"),
+}
+OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 NUMBERS = re.compile(r"[-+.,0-9e ]{1,60}")  # one or several, with commas
 
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
@@ -167,23 +174,47 @@ def load_object(name: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def settings_errors(error: ValidationError, given: Any = None) -> str:
+def alternatives(names: Sequence[str]) -> str:
+    """Return one or more names for a message, the last one after "or"."""
+    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def settings_errors(error: ValidationError, given: Any = None, lookup: str = "") -> str:
     """Return the wrong fields of settings with their values and the allowed ones, for a message.
 
     Args:
         error: of pydantic.
         given: settings that were validated, from which kinds are recognized.
+        lookup: command that shows the range of a setting whose name follows; empty if there is none.
     """
-    lines = []
+    lines, numbers = [], set()
     for each in error.errors():
         name = _setting_name(each["loc"], given)  # empty if all settings together are refused
-        value, message = each["input"], each["msg"].removeprefix("Value error, ")
-        if name and each["type"] in NO_LIST:
-            items = value if NUMBERS.fullmatch(str(value)) else "..."
-            lines.append(f"{name} = {quoted(value)} is not a list; write for example `--set '{name}=[{items}]'`")
-        else:
-            lines.append(f"{name} = {quoted(value)}: {message}" if name else message)
+        lines.append(_refusal(name, each) if name else _message(each))
+        if name and (each["type"] in NO_NUMBER or each["type"] in OUT_OF_RANGE):
+            above_lists = tuple(takewhile(lambda part: isinstance(part, str), each["loc"]))
+            numbers.add(_setting_name(above_lists, given))
+    if lookup and numbers:
+        lines.append(f"`{lookup} {numbers.pop() if len(numbers) == 1 else 'NAME'}` shows what is allowed")
     return "; ".join(lines)
+
+
+def _refusal(name: str, error: Mapping[str, Any]) -> str:
+    """Return what is wrong with one setting, and what is allowed."""
+    kind, value = error["type"], error["input"]
+    if kind in NO_LIST:
+        items = value if NUMBERS.fullmatch(str(value)) else "..."
+        return f"{name} = {quoted(value)} is not a list; write for example `--set '{name}=[{items}]'`"
+    if kind == "union_tag_invalid":
+        known = error["ctx"]["expected_tags"].replace("'", "").split(", ")
+        return f"{name}.kind = {quoted(error['ctx']['tag'])}: use {alternatives(known)}"
+    if kind in NO_NUMBER:
+        return f"{name} = {quoted(value)} {NO_NUMBER[kind]}"
+    return f"{name} = {quoted(value)}: {_message(error)}"
+
+
+def _message(error: Mapping[str, Any]) -> str:
+    return str(error["msg"]).removeprefix("Value error, ")
 
 
 def _setting_name(location: tuple[int | str, ...], given: Any) -> str:

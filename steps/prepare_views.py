@@ -37,7 +37,7 @@ RELIABLE = 0.9  # mean share from which colors of the hull's surface are compare
 FEW = 4  # views; among more, thin parts seen edge-on fill little of single silhouettes
 LEAST_MEAN = 0.6  # mean share of many silhouettes, likewise
 GOOD = 0.95  # mean share from which pictures are taken to have the scale of the input
-INPUT, TURNTABLE = "the input", "the turntable"  # names for messages
+INPUT, TURNTABLE = "the input", "--turntable"  # names for messages
 ViewsByFrame = list[list[KnownView]]  # views by frame
 
 
@@ -225,18 +225,18 @@ def check_turn(source: Source) -> None:
     """
     if source.kind != "video" or source.count < FEWEST_FRAMES:
         raise BadInput(
-            f"the turntable has {source.count} frame{'s' * (source.count != 1)}; give a video of one whole turn with "
-            f"{FEWEST_FRAMES} or more"
+            f"{TURNTABLE} has {source.count} frame{'s' * (source.count != 1)}; give a video, or a folder of frames, of "
+            f"one whole turn with {FEWEST_FRAMES} or more"
         )
     color = over_white(source.frames)
     from_first = (color - color[:1]).abs().mean((1, 2, 3))
     steps = color.diff(dim=0).abs().mean((1, 2, 3))
     if float(from_first.max()) < STILL:
-        raise BadInput("the turntable shows no turn: its frames are alike; film the still subject turned once")
+        raise BadInput(f"{TURNTABLE} shows no turn: its frames are alike; film the still subject turned once")
     gap = source.count - 1 - evenly_spaced(source.count, TURNTABLE_FRAMES)[-2]
     if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / gap):
         raise BadInput(
-            "the turntable is no whole turn: its last frame is unlike its first; film one turn, cut right before the "
+            f"{TURNTABLE} is no whole turn: its last frame is unlike its first; film one turn, cut right before the "
             "first picture comes back"
         )
 

@@ -34,7 +34,7 @@ from dg4d_lib.settings import (
 )
 from dg4d_lib.weights.registry import lookup_weights
 from steps.catalog import STEPS
-from steps.contract import StepSpec, load_object, settings_errors
+from steps.contract import StepSpec, alternatives, load_object, settings_errors
 
 LARGEST_WHOLE = 2**53  # largest integer that every JSON reader represents exactly
 ZERO123_VARIANTS = {"zero123-xl": "xl", "stable-zero123": "stable"}  # by name in the registry
@@ -260,7 +260,7 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
-        raise BadInput(f"settings refused: {settings_errors(error, tree)}") from error
+        raise BadInput(f"settings refused: {settings_errors(error, tree, 'dg4d settings')}") from error
 
 
 def _kinds_with(section: Sequence[str], rest: Sequence[str]) -> list[str]:
@@ -291,9 +291,9 @@ def _classes_of(owner: type[Settings], name: str) -> list[type[Settings]]:
 
 
 def _other_kind(key: str, section: str, kinds: list[str], chosen: str) -> str:
-    names = " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
     return (
-        f"{key} exists with {section}.kind={names}; {section}.kind is {chosen}. Add `--set {section}.kind={kinds[0]}`."
+        f"{key} exists with {section}.kind={alternatives(kinds)}; {section}.kind is {chosen}. "
+        f"Add `--set {section}.kind={kinds[0]}`."
     )
 
 

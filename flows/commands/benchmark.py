@@ -66,6 +66,8 @@ def score(
         BadInput: the asset, the ground truth or a setting cannot be used, or `out` cannot be written.
         StepError: the step failed.
     """
+    if not truth.exists():
+        raise BadInput(f"--truth: {truth} does not exist; give a folder of an object, or a picture")
     found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"only settings that begin with {SCORE!r} apply to a finished asset; given {min(pipeline)}")

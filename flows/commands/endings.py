@@ -47,8 +47,12 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def exit_on_error() -> Iterator[None]:
-    """Exit with one message and a status on any error; treat SIGTERM and SIGHUP like Ctrl-C."""
+def exit_on_error(stopped: str = STOPPED) -> Iterator[None]:
+    """Exit with one message and a status on any error; treat SIGTERM and SIGHUP like Ctrl-C.
+
+    Args:
+        stopped: message after Ctrl-C or a signal.
+    """
     with _signals() as received:
         try:
             yield
@@ -56,11 +60,11 @@ def exit_on_error() -> Iterator[None]:
             raise
         except KeyboardInterrupt as error:
             _stop_steps()
-            _end(STOPPED, CODES[error.number] if isinstance(error, Terminated) else EXIT_INTERRUPTED)
+            _end(stopped, CODES[error.number] if isinstance(error, Terminated) else EXIT_INTERRUPTED)
         except Exception as error:
             if received:  # the error may be a consequence, such as a write to a closed terminal
                 _stop_steps()
-                _end(STOPPED, CODES[received[0]])
+                _end(stopped, CODES[received[0]])
             if isinstance(error, BrokenPipeError) and _output_closed():
                 raise typer.Exit(EXIT_PIPE) from None  # as `dg4d settings | head`
             _end(*describe(error))

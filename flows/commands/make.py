@@ -32,7 +32,7 @@ class Wish:
         asset: the user's own model.
         alone: an option of the command line that makes one asset; empty if none is given.
         out: output folder; of several pictures the folder above those of the assets.
-        force: replace another asset in the output folder.
+        force: replace an asset of another name in the output folder.
         picked: true if `--pick` chooses a motion.
         request: returns the checked request of an item with its picture.
     """
@@ -92,11 +92,19 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
     check_folder(folder, item, wish.force)
     with stored(request) as job:
         named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
-        cached = named == item and is_up_to_date(folder, job.digest())
-        if not cached:
+        up_to_date = cached = named == item and is_up_to_date(folder, job.digest())
+        if not up_to_date:
+            if named == item and (record_of(folder) or {}).get("source", job.source.digest) != job.source.digest:
+                console.print(
+                    f"note: {folder} holds the asset {item} of another source; it is replaced (the store keeps the "
+                    "earlier version); -o chooses another folder",
+                    markup=False,
+                )
             _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder, force=wish.force))
-    if cached:
+    if up_to_date:
         console.print("nothing to do: every step was already done")
+    elif cached:
+        console.print("no step to do: the package was written from finished steps")
     written = (record_of(folder) or {"files": {}})["files"]
     terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
     terminal.print_next(console, folder)

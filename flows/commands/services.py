@@ -20,6 +20,7 @@ POLL_S = 1.0  # between two scans of a watched folder
 RESULTS_EVERY_S = 5.0  # between two looks for finished packages
 FORM = "then choose Deployments, Picture to 4D, Run"
 OPEN_OWN = f"open this address first: it signs the browser in to the Prefect UI; {FORM}"
+WATCH_STOPPED = "stopped watching; conversions that were sent go on until `dg4d down`"
 OPEN_OTHER = f"open this address, the Prefect UI of $PREFECT_API_URL; {FORM}"
 
 
@@ -197,26 +198,31 @@ def watch(
     """Convert the files that are dropped into a folder.
 
     Uses the deployment "Catalog to 4D" of `dg4d up`, and runs until it is stopped. A manifest directly in the folder
-    names what is converted; without one, that is every picture and video. When the command is started again, it sends
-    the folder once more: finished items are skipped, failed ones are tried again.
+    names what is converted; without one, that is every picture and video. Other files are ignored, and models need a
+    manifest. When the command is started again, it sends the folder once more: finished items are skipped, failed ones
+    are tried again.
     """
-    with exit_on_error():
+    with exit_on_error(WATCH_STOPPED):
         from dg4d_lib.errors import BadInput
         from flows.convert import connect
         from flows.packages.publish import check_writable
+        from flows.serving.results import Results, check_watched
 
+        check_watched(folder, out)
         check_writable(out)
         connect()
         import httpx
 
-        from flows.serving.results import Results
         from flows.serving.roots import granted
         from flows.serving.watching import FailedRuns, Watcher, announce, check_registered
         from flows.ui.showing import revive
 
         check_registered()
         watcher = Watcher(folder, out, rest_s)
-        typer.echo(f"watching {watcher.folder}; packages go to {watcher.out}; stop with Ctrl-C")
+        typer.echo(
+            f"watching {watcher.folder} for pictures, videos and manifests (other files are ignored, models need a "
+            f"manifest); packages go to {watcher.out}; stop with Ctrl-C"
+        )
         results, runs = Results(watcher.out), FailedRuns(watcher.out)
         looked, trouble = 0.0, ""
         with granted(watcher.folder, watcher.out):
@@ -241,7 +247,7 @@ def watch(
                         revive()
                     else:
                         watcher.told()
-                        typer.echo(f"files came to rest; sent to the server: {digest}")
+                        typer.echo("files came to rest; sent to the server; packages are named here when they are done")
                     if trouble not in {"", before}:
                         typer.echo(trouble, err=True)
                 time.sleep(POLL_S)

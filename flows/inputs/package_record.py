@@ -3,12 +3,25 @@
 from pathlib import Path
 from typing import Any
 
+from dg4d_lib.errors import BadInput
 from flows.inputs.json_text import loads
 from steps.artifacts.archives import can_exist, stays_inside
 from steps.store.files import require_regular
 
 RECORD = "provenance.json"
 FORMAT = 2  # of the record
+
+
+def check_is_folder(place: Path) -> None:
+    """Refuse a path of a package that does not exist or is a file.
+
+    Raises:
+        BadInput: says what to give instead.
+    """
+    if place.is_file():
+        raise BadInput(f"{place} is a file; give its folder {place.parent}")
+    if not place.is_dir():
+        raise BadInput(f"{place} does not exist; give a folder that `dg4d make` wrote")
 
 
 def record_of(folder: Path) -> dict[str, Any] | None:

@@ -24,6 +24,7 @@ AUTHOR = "DG4D_AUTHOR"  # environment variable: NAME <URL>
 ORCID = "https://orcid.org/"  # of persons; other addresses are of organizations
 PACKAGE_INDEX = "https://pypi.org/"
 CRATE = "ro-crate-metadata.json"
+OWN_DIGEST = "#sha256-of-this-document"
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"
 CONTEXT = [f"{SPECIFICATION}/context", "https://w3id.org/ro/terms/workflow-run/context"]
@@ -58,7 +59,7 @@ def crate_text(record: Mapping[str, Any], beside: Files, about: str, author: str
     entities = _entities(record, beside, about, _author(author))
     graph = list({entity["@id"]: _without_empty(entity) for entity in entities}.values())
     document = {"@context": CONTEXT, "@graph": graph}
-    graph[0]["sha256"] = crate_digest(document)
+    _stated(document)[0]["value"] = crate_digest(document)
     return render_crate(document)
 
 
@@ -68,10 +69,27 @@ def render_crate(document: Mapping[str, Any]) -> str:
 
 
 def crate_digest(document: Mapping[str, Any]) -> str:
-    """Return the sha256 of a crate without its own `sha256` field, as 64 digits."""
-    first, *others = document["@graph"]
-    bare = {name: value for name, value in first.items() if name != "sha256"}
-    return digest_of({**document, "@graph": [bare, *others]}).removeprefix("sha256:")
+    """Return the sha256 of a crate without the digest that it states itself, as 64 digits."""
+    place, key = _stated(document)
+    bare = {name: value for name, value in place.items() if name != key}
+    graph = [bare if entity is place else entity for entity in document["@graph"]]
+    return digest_of({**document, "@graph": graph}).removeprefix("sha256:")
+
+
+def stated_digest(document: Mapping[str, Any]) -> str:
+    """Return the digest that a crate states of itself, as 64 digits.
+
+    Raises:
+        LookupError: it states none.
+    """
+    place, key = _stated(document)
+    return str(place[key])
+
+
+def _stated(document: Mapping[str, Any]) -> tuple[Entity, str]:
+    """Return the entity and the field of a crate's own digest: `sha256` of the descriptor before November 2026."""
+    graph = document["@graph"]
+    return next(((entity, "value") for entity in graph if entity["@id"] == OWN_DIGEST), (graph[0], "sha256"))
 
 
 def files_in(document: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
@@ -81,7 +99,7 @@ def files_in(document: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
 
 
 def _entities(record: Mapping[str, Any], beside: Files, about: str, authors: list[Entity]) -> Iterator[Entity]:
-    """Yield the descriptor, the package, then the rest; an entity may come more than once."""
+    """Yield the descriptor with an empty digest, the package, then the rest; an entity may come more than once."""
     files = {**record["files"], **beside}
     runs = list(zip(record["steps"], record["run"]["steps"], strict=True))
     names = _ids_by_digest(record)
@@ -92,6 +110,7 @@ def _entities(record: Mapping[str, Any], beside: Files, about: str, authors: lis
         "@type": "CreativeWork",
         "conformsTo": _reference(SPECIFICATION),
         "about": _reference("./"),
+        "identifier": _reference(OWN_DIGEST),
     }
     yield {
         "@id": "./",
@@ -108,6 +127,7 @@ def _entities(record: Mapping[str, Any], beside: Files, about: str, authors: lis
         "mentions": actions,
     }
     yield from authors
+    yield _property(OWN_DIGEST, "SHA-256 of this document without this value, in canonical JSON", "")
     yield {"@id": PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"}
     yield {
         "@id": "#license",

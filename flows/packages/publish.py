@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 
 from dg4d_lib.errors import BadInput, listed
 from flows.inputs.naming import check_folder_name
-from flows.inputs.package_record import RECORD, record_of
+from flows.inputs.package_record import RECORD, check_is_folder, record_of
 from flows.processes import host_id
 from steps.artifacts.archives import unpack
 from steps.store.files import remove_tree, require_regular, room_for, walk
@@ -101,6 +101,7 @@ def load_verified(folder: Path) -> dict[str, Any]:
     Raises:
         BadInput: there is no package, or files of it are missing or altered; names them.
     """
+    check_is_folder(folder)
     record = record_of(folder)
     if record is None:
         raise BadInput(f"{folder} is not an asset: it has no valid {RECORD}; give a folder that `dg4d make` wrote")

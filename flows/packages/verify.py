@@ -8,9 +8,9 @@ from typing import Any, Literal
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING
 from flows.inputs.json_text import loads
-from flows.inputs.package_record import FORMAT, RECORD, record_of
+from flows.inputs.package_record import FORMAT, RECORD, check_is_folder, record_of
 from flows.inputs.signing_key import CERTIFICATE
-from flows.packages.crate import CRATE, crate_digest, files_in, render_crate
+from flows.packages.crate import CRATE, crate_digest, files_in, render_crate, stated_digest
 from flows.packages.credentials import check_signature, sidecar_name
 from flows.packages.publish import file_digest
 from steps.contract import RUN_ONLY, Frozen, digest_of
@@ -74,6 +74,7 @@ def verify(folder: Path, anchors: Path | None = None) -> Verification:
     Raises:
         BadInput: there is no package, its record has another format, or the anchors cannot be read.
     """
+    check_is_folder(folder)
     record = record_of(folder)
     if record is None:
         raise BadInput(f"{folder} is not an asset: it has no valid {RECORD}; give a folder that `dg4d make` wrote")
@@ -135,7 +136,7 @@ def _crate(path: Path) -> tuple[dict[str, dict[str, Any]], Check]:
         require_regular(path)
         text = path.read_text(encoding="utf-8")
         document = loads(text)
-        whole = text == render_crate(document) and document["@graph"][0]["sha256"] == crate_digest(document)
+        whole = text == render_crate(document) and stated_digest(document) == crate_digest(document)
         listed = {name: {"digest": digest, "size_bytes": size} for name, (digest, size) in files_in(document).items()}
     except FileNotFoundError:
         return {}, Check(kind="file", name=CRATE, state="missing")

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from dg4d_lib.errors import BadInput
 from flows.formatting.escaping import visible
 from steps.store.files import require_regular
 
@@ -57,6 +58,19 @@ class Results:
         acceptance = _read(self.out / name / REPORT).get("acceptance")
         failing = acceptance.get("failing") if isinstance(acceptance, dict) else None
         return f" (not accepted: {', '.join(map(str, failing))})" if isinstance(failing, list) and failing else ""
+
+
+def check_watched(folder: Path, out: Path) -> None:
+    """Refuse a folder that cannot be watched for an output folder.
+
+    Raises:
+        BadInput: there is no such folder, or it is in the output folder.
+    """
+    if not folder.is_dir():
+        state = "is not a folder" if folder.exists() else "does not exist"
+        raise BadInput(f"{folder} {state}; give a folder into which pictures, videos or a manifest are dropped")
+    if folder.resolve().is_relative_to(out.resolve()):
+        raise BadInput(f"the output folder {out} holds the watched folder {folder}; choose another with -o")
 
 
 def visible_files(folder: Path) -> Iterator[Path]:

@@ -23,7 +23,7 @@ from flows.formatting.escaping import visible
 from flows.inputs import models
 from flows.inputs.listing import SUFFIXES
 from flows.inputs.rows import MANIFESTS
-from flows.serving.results import visible_files
+from flows.serving.results import check_watched, visible_files
 from steps.contract import digest_of
 
 CHANGED = "dg4d.folder.changed"  # event of the trigger in deploy/prefect.yaml
@@ -44,14 +44,14 @@ class Watcher:
         folder: watched folder with its subfolders; hidden files do not count.
         out: output folder; its files do not count.
         rest_s: seconds without a change before files count as complete.
+
+    Raises:
+        BadInput: there is no such folder, or it is in the output folder.
     """
 
     def __init__(self, folder: Path, out: Path, rest_s: float) -> None:
-        if not folder.is_dir():
-            raise BadInput(f"{folder} is not a folder; give one into which pictures, videos or a manifest are dropped")
+        check_watched(folder, out)
         self.folder, self.out, self.rest_s = folder.resolve(), out.resolve(), rest_s
-        if self.folder.is_relative_to(self.out):
-            raise BadInput(f"the output folder {out} holds the watched folder {folder}; choose another with -o")
         self._seen: dict[str, tuple[Stamp, float]] = {}  # with the time of the look that saw it first
         self._told: dict[str, Stamp] = {}
 
@@ -157,7 +157,10 @@ def check_registered() -> None:
         except ObjectNotFound:
             is_there = False
     if not is_there:
-        raise BackendUnavailable(f"the Prefect server lacks {DEPLOYMENT!r} or its trigger; run `dg4d up` first")
+        raise BackendUnavailable(
+            f'no deployment "{DEPLOYMENT.partition("/")[2]}" with its trigger on the Prefect server, which converts '
+            "the files; run `dg4d up` first"
+        )
 
 
 def announce(folder: Path, inputs: Path, out: Path, digest: str) -> None:

@@ -1,6 +1,7 @@
 """Rendering of finished packages from any camera at any time, for `dg4d render` and the metrics."""
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,6 +38,7 @@ from steps.artifacts.packages import (
 
 BATCH = 8  # pictures per rasterizer call, bounds the memory
 SMALLEST, LARGEST = 16, 4096  # pixels of a side
+FRAME_FILE = re.compile(r"([0-9]{3}|[1-9][0-9]{3,8})\.png")  # names of `_file_name`
 OPAQUE = 0.5  # alpha above which a pixel on the edge of a picture counts as cut off
 
 States = Callable[[Float[Tensor, " b"]], Gaussians]  # Gaussians at positions of the animation, in frames
@@ -75,7 +77,8 @@ def render_package(
         size: pixels of a side, 16 to 4096.
         frames: number of pictures, evenly spaced from the first to the last frame of the fit; None: one per frame.
         mesh: render the textured mesh instead of the splats.
-        out: folder, made if necessary; pictures of the same name are replaced.
+        out: folder, made if necessary. Pictures of the same name are replaced, those of later frames in the same views
+            are removed.
         rasterizer: name of the rasterizer for splats.
         fit: take the field of view that holds the whole asset from all sides (`whole_fov_y_deg` of the manifest)
             instead of that of the input picture.
@@ -102,9 +105,22 @@ def render_package(
         for start in range(0, count, BATCH):
             part = positions[start : start + BATCH]
             for frame, picture in enumerate(draw(part, [camera] * len(part)), start):
-                write_png(view / f"{frame:03d}.png", picture)
+                write_png(view / _file_name(frame), picture)
                 cropped += _touches_edge(picture)
+        _remove_after(count, view)
     return Renders(views, cropped)
+
+
+def _file_name(frame: int) -> str:
+    return f"{frame:03d}.png"
+
+
+def _remove_after(count: int, view: Path) -> None:
+    """Remove the pictures that an earlier run with more frames left in a view; other files stay."""
+    for path in view.iterdir():
+        frame = FRAME_FILE.fullmatch(path.name)
+        if frame and int(frame[1]) >= count and path.is_file():
+            path.unlink()
 
 
 def _whole_fov_y_deg(folder: Path, manifest: Manifest) -> float:

@@ -159,12 +159,12 @@ class SurfaceTracker:
         """Return what one more fit reports its iterations to."""
         number = next(self._numbers)
 
-        def told(iteration: int, values: dict[str, float]) -> None:
+        def on_progress(iteration: int, values: dict[str, float]) -> None:
             self._done[number] = iteration
             if threading.get_ident() == self._here:
                 self._report(min(sum(self._done), self._most), values)
 
-        return told
+        return on_progress
 
     def _overlap(self, moved: MovedSurfaces) -> float:
         """Return the intersection over union of silhouettes at the input view, mean over frames."""

@@ -31,17 +31,17 @@ def read_mask(
     try:
         mask = read_source(path, scratch, max_frames, max_decode_gb)
     except BadInput as error:
-        raise BadInput(f"the mask: {error}") from error
+        raise BadInput(f"--mask: {error}") from error
     if mask.size != source.size:
         raise BadInput(
-            f"the mask is {_by(mask.size)} pixels, the {source.kind} {_by(source.size)}; draw the mask at the size of "
+            f"--mask is {_by(mask.size)} pixels, the {source.kind} {_by(source.size)}; draw the mask at the size of "
             f"the {source.kind}"
         )
     if mask.count != source.count:
-        raise BadInput(
-            f"the mask has {mask.count} frame{'s' * (mask.count != 1)}, the {source.kind} {source.count}; give a "
-            "picture for a picture, and a folder with a mask for every frame of a video"
-        )
+        given = f"--mask has {mask.count} frame{'s' * (mask.count != 1)}"
+        if source.kind == "picture":
+            raise BadInput(f"{given}, and the input is one picture; give one picture as the mask")
+        raise BadInput(f"{given}, the video {source.count}; give a folder with one mask for every frame")
     values = mask.frames[..., 3] if mask.has_alpha else mask.frames[..., :3].mean(-1)
     return resize_planes(values[None], source.frames.shape[1:3])[0].clamp(0, 1)
 

@@ -17,6 +17,7 @@ VIEWS_JSON = "views.json"
 LARGEST_JSON = 16 * 2**20  # bytes
 MOST_VIEWS = 64  # pictures or cameras
 CLOSE_DEG = 2.0  # two views nearer to each other count as one
+LARGEST_AZIMUTH_DEG = 360.0
 HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth says nothing
 OTHER_SHAPE = 0.02  # ratio of width to height by which picture and camera may differ: rounding after shrinking
 DISTORTED = 0.05  # largest lens distortion coefficient that is ignored
@@ -72,7 +73,7 @@ class GivenView(Frozen):
 
     file: str
     name: str
-    azimuth: float = Field(0.0, ge=-360, le=360)
+    azimuth: float = Field(0.0, ge=-LARGEST_AZIMUTH_DEG, le=LARGEST_AZIMUTH_DEG)
     elevation: float = Field(0.0, ge=-HIGHEST_DEG, le=HIGHEST_DEG)
     camera: PlacedCamera | None = None
 
@@ -136,13 +137,16 @@ def check_direction(azimuth: float, elevation: float, name: str) -> None:
         name: of the view, for the message.
 
     Raises:
-        BadInput: names the view, the direction and what is allowed.
+        BadInput: names the view, the wrong angle and what is allowed.
     """
-    if not (abs(azimuth) <= 360 and abs(elevation) <= HIGHEST_DEG):  # NaN is out of range, too
-        raise BadInput(
-            f"{quoted(name)}: azimuth {azimuth:g} and elevation {elevation:g} are out of range; azimuths from -360 to "
-            f"360 and elevations from -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} are allowed"
-        )
+    angles = (("azimuth", azimuth, LARGEST_AZIMUTH_DEG), ("elevation", elevation, HIGHEST_DEG))
+    wrong = [
+        f"{angle} {value:g} is out of range; use -{most:g} to {most:g}"
+        for angle, value, most in angles
+        if not abs(value) <= most  # NaN is out of range, too
+    ]
+    if wrong:
+        raise BadInput(f"{quoted(name)}: {'; '.join(wrong)}")
 
 
 def check_apart(places: list[tuple[float, float, str]]) -> None:

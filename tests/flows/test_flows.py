@@ -71,7 +71,7 @@ def test_a_lost_artifact_is_made_again(log: Path, tmp_path: Path) -> None:
 def test_a_video_moves_the_asset_and_a_picture_is_no_video(log: Path, tmp_path: Path) -> None:
     convert_job(job("moving film", tmp_path, name="film.mp4"), tmp_path / "out")
     assert "the motion follows the video" in (tmp_path / "out" / "report.json").read_text()
-    with pytest.raises(StepBadInput, match="single picture"):
+    with pytest.raises(StepBadInput, match=r"single picture.* give a longer one"):
         convert_job(job("still", tmp_path, name="still.mp4"), tmp_path / "still")
     assert not (tmp_path / "still").exists()
 
@@ -156,7 +156,7 @@ def test_two_runs_into_one_folder_take_turns_and_the_second_finds_it_done(log: P
     assert [command.returncode for command in both] == [0, 0]
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert sum("waiting for another run" in text for text in said) == 1
-    assert sum("nothing to do" in text for text in said) == 1
+    assert sum("no step to do" in text for text in said) == 1
     load_verified(tmp_path / "out")
 
 
@@ -172,6 +172,15 @@ def test_a_package_of_another_asset_is_replaced_only_by_force(dg4d: Run, log: Pa
     assert json.loads((tmp_path / "same" / "provenance.json").read_text())["item"] == "two"
 
 
+def test_an_asset_of_another_source_with_the_same_name_is_replaced_with_a_note(dg4d: Run, log: Path) -> None:
+    for folder in ("a", "b"):
+        Path(folder).mkdir()
+        Path(folder, "x.png").write_text(picture(f"same name {folder}"))
+    assert "note: " not in dg4d("make", "a/x.png").stdout
+    assert "note: out/x holds the asset x of another source; it is replaced" in dg4d("make", "b/x.png").stdout
+    assert "note: " not in dg4d("make", "b/x.png", "--seed", "1").stdout
+
+
 def test_what_a_gate_does_not_let_pass_is_said_at_the_end(dg4d: Run, log: Path, tmp_path: Path) -> None:
     for words, told in (("torn again", True), ("fine again", False)):
         (tmp_path / "x.png").write_text(picture(words))
@@ -185,10 +194,11 @@ def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Pa
     assert "nothing to do" not in dg4d("make", "x.png").output
     ran(log)
     before = tree(tmp_path / "out" / "x")
-    for out in ("out/x", "out/y"):
+    says = {"out/x": "nothing to do: every step was already done", "out/y": "no step to do: the package was written"}
+    for out, line in says.items():
         done = dg4d("make", "x.png", "-o", out)
         assert done.exit_code == 0
-        assert "nothing to do: every step was already done" in done.stdout
+        assert [word for word in says.values() if word in done.stdout] == [line]
     assert ran(log) == []
     assert tree(tmp_path / "out" / "x") == before
     assert tree(tmp_path / "out" / "y", *RUN_FACTS) == {k: v for k, v in before.items() if k not in RUN_FACTS}

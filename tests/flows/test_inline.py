@@ -156,7 +156,7 @@ def test_steps_are_retried_as_often_as_by_prefect(alone: Path, tmp_path: Path, w
 
 def test_a_picture_given_as_a_video_is_refused(alone: Path, tmp_path: Path) -> None:
     still = job("still", tmp_path).model_copy(update={"moving": True})
-    with pytest.raises(StepBadInput, match="single picture"):
+    with pytest.raises(StepBadInput, match=r"--video: this is a single picture.* run `dg4d make fake.png`"):
         convert_inline(still, tmp_path / "out")
 
 

@@ -269,7 +269,7 @@ def test_a_video_takes_a_mask_for_every_frame(tmp_path):
 @pytest.mark.parametrize(
     ("mask", "says"),
     [
-        (lambda height, width: half_mask(height, width + 8), r"the mask is \d+ x \d+ pixels, the picture \d+ x \d+"),
+        (lambda height, width: half_mask(height, width + 8), r"--mask is \d+ x \d+ pixels, the picture \d+ x \d+"),
         (lambda height, width: np.zeros((height, width, 3), np.uint8), "the mask is empty"),
     ],
     ids=["size", "empty"],
@@ -283,8 +283,16 @@ def test_a_mask_that_does_not_fit_is_refused(tmp_path, mask, says):
 def test_one_mask_for_a_video_is_refused(tmp_path):
     film = [frame[..., :3] for frame in walk(4)]
     mask = save(tmp_path / "m.png", half_mask(*film[0].shape[:2]))
-    with pytest.raises(BadInput, match="the mask has 1 frame, the video 4; give a picture for a picture"):
+    says = "--mask has 1 frame, the video 4; give a folder with one mask for every frame"
+    with pytest.raises(BadInput, match=says):
         prepare(zipped(tmp_path / "film.zip", film), tmp_path / "out", mask)
+
+
+def test_several_masks_for_a_picture_are_refused(tmp_path):
+    picture = opaque(disc())
+    masks = zipped(tmp_path / "masks.zip", [half_mask(*picture.shape[:2])] * 6)
+    with pytest.raises(BadInput, match="--mask has 6 frames, and the input is one picture; give one picture as"):
+        prepare(save(tmp_path / "a.png", picture), tmp_path / "out", masks)
 
 
 def two_squares() -> np.ndarray:

@@ -47,6 +47,52 @@ def test_a_refused_list_is_told_how_it_is_written(name: str, value: object, mess
         revise(PREVIEW, {name: value})
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prior.kind": "geometrc"}, "prior.kind = 'geometrc': use geometric, learned, zero123, imagedream or oracle"),
+        ({"views.kind": 5}, "views.kind = '5': use none or image_edit"),
+        ({"static.start.kind": "x"}, "static.start.kind = 'x': use blob, surface or lgm"),
+    ],
+)
+def test_an_unknown_kind_is_told_the_known_ones(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(BadInput) as refusal:
+        revise(PREVIEW, changes)
+    assert str(refusal.value) == f"settings refused: {message}"
+
+
+SHOWN = "; `dg4d settings motion.iterations` shows what is allowed"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"motion.iterations": 0}, "motion.iterations = 0: Input should be greater than or equal to 1" + SHOWN),
+        ({"motion.iterations": "ten"}, "motion.iterations = 'ten' is no whole number" + SHOWN),
+        ({"motion.iterations": 1.5}, "motion.iterations = 1.5 is no whole number" + SHOWN),
+        ({"motion.iterations": None}, "motion.iterations = None is no whole number" + SHOWN),
+        (
+            {"prior.weight": "x"},
+            "prior.weight = 'x' is no number; `dg4d settings prior.weight` shows what is allowed",
+        ),
+        (
+            {"subject.box": [0, -1, "x", 4]},
+            "subject.box.1 = -1: Input should be greater than or equal to 0; subject.box.2 = 'x' is no whole number; "
+            "`dg4d settings subject.box` shows what is allowed",
+        ),
+        (
+            {"motion.iterations": "ten", "static.iterations": -1},
+            "static.iterations = -1: Input should be greater than or equal to 0; motion.iterations = 'ten' is no whole "
+            "number; `dg4d settings NAME` shows what is allowed",
+        ),
+    ],
+)
+def test_a_refused_number_is_told_where_its_range_stands(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(BadInput) as refusal:
+        revise(PREVIEW, changes)
+    assert str(refusal.value) == f"settings refused: {message}"
+
+
 PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.98, "static.t_max_end": 0.02,
          "motion.iterations": 200, "motion.views": 4, "motion.t_max_start": 0.5, "motion.t_max_end": 0.02,
          "static.t_max_limit": 0.98, "motion.t_max_limit": 0.98, "motion.guidance_weight": 1.0,

@@ -61,6 +61,19 @@ def test_every_view_has_its_folder_and_every_frame_its_picture(package: Path, tm
         assert pictures(view).shape == (FRAMES, SIZE, SIZE, 4)
 
 
+def test_pictures_beyond_the_last_are_removed_and_other_files_stay(package: Path, tmp_path: Path) -> None:
+    stay = [tmp_path / "view_0" / name for name in ("notes.txt", "04.png", "0007.png", "x007.png", "007.jpg")]
+    stay.append(tmp_path / "view_90" / "007.png")  # of a view that is not written
+    removed = [tmp_path / "view_0" / name for name in ("002.png", "007.png", "1000.png")]
+    for path in (*stay, *removed):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    (tmp_path / "view_0" / "008.png").mkdir()
+    (view,) = render(package, tmp_path, frames=2)
+    assert all(path.exists() for path in stay) and not any(path.exists() for path in removed)
+    assert {"000.png", "001.png", "008.png"} <= {path.name for path in view.iterdir()}
+
+
 @pytest.mark.parametrize("mesh", [False, True])
 @pytest.mark.parametrize("azimuth_deg", [0.0, 180.0, 40.0])
 def test_the_object_is_where_the_motion_takes_it(package: Path, tmp_path: Path, mesh: bool, azimuth_deg: float) -> None:

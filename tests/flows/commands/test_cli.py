@@ -5,13 +5,14 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fake_steps import PNG, bank_json, picture
 from typer.testing import CliRunner, Result
 
 from flows import cli
-from steps.artifacts import rendering
+from steps.artifacts import packages, rendering
 from steps.store import artifact_store as store_module
 
 
@@ -47,16 +48,51 @@ def test_a_missing_file() -> None:
     refused(dg4d("make", "dog.png", "-o", "out"), "dog.png does not exist")
 
 
-@pytest.mark.parametrize(("options", "cropped", "says"), [([], 3, "edge: 3; --fit"), ([], 0, ""), (["--fit"], 3, "")])
-def test_cropped_renders_are_told(monkeypatch: pytest.MonkeyPatch, options: list[str], cropped: int, says: str) -> None:
+@pytest.mark.parametrize(
+    ("options", "cropped", "whole", "says"),
+    [
+        ([], 3, 60.0, "edge: 3; --fit"),
+        ([], 3, None, "edge: 3; make the asset again with this dg4d, then --fit"),
+        ([], 0, 60.0, ""),
+        (["--fit"], 3, 60.0, ""),
+    ],
+)
+def test_cropped_renders_are_told(
+    monkeypatch: pytest.MonkeyPatch, options: list[str], cropped: int, whole: float | None, says: str
+) -> None:
     def render_package(*_: object, fit: bool) -> rendering.Renders:
         assert fit == ("--fit" in options)
         return rendering.Renders([Path("out/view_0")], cropped)
 
     monkeypatch.setattr(rendering, "render_package", render_package)
+    manifest = SimpleNamespace(camera=packages.Camera(whole_fov_y_deg=whole))
+    monkeypatch.setattr(packages, "read_manifest", lambda _: manifest)
     result = dg4d("render", ".", "-o", "out", *options)
     assert result.stdout == "out/view_0\n"
     assert says in result.stderr if says else not result.stderr
+
+
+@pytest.mark.parametrize(
+    "command", [("render", "-o", "out"), ("compose", "-o", "out/a.glb"), ("view",), ("verify",), ("rebuild",)]
+)
+def test_a_package_that_does_not_exist(command: tuple[str, ...]) -> None:
+    refused(dg4d(*command, "nowhere"), "nowhere does not exist; give a folder that `dg4d make` wrote")
+
+
+def test_a_file_of_a_package_instead_of_its_folder() -> None:
+    Path("fox").mkdir()
+    Path("fox/asset.glb").touch()
+    refused(dg4d("render", "fox/asset.glb", "-o", "out"), "fox/asset.glb is a file; give its folder fox")
+
+
+def test_ground_truth_that_does_not_exist() -> None:
+    says = "--truth: nowhere does not exist; give a folder of an object, or a picture"
+    refused(dg4d("score", "fox", "--truth", "nowhere"), says)
+
+
+def test_a_folder_to_watch_is_checked_before_a_server_is_asked() -> None:
+    refused(dg4d("watch", "nowhere", "-o", "out"), "nowhere does not exist; give a folder into which")
+    refused(dg4d("watch", "cat.png", "-o", "out"), "cat.png is not a folder; give a folder into which")
 
 
 def test_a_folder_instead_of_a_file() -> None:

@@ -237,6 +237,22 @@ def test_a_watch_announces_a_manifest_and_waits_while_there_are_several(
     assert capsys.readouterr().err.count("several manifests (a.csv, b.csv)") == 1
 
 
+def test_a_watch_says_what_it_reads_and_what_goes_on_after_it(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def sleep(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(watching, "announce", lambda *_: None)
+    monkeypatch.setattr(services.time, "sleep", sleep)
+    with pytest.raises(typer.Exit):
+        services.watch(inbox, inbox.parent / "out", 0.0)
+    said = capsys.readouterr()
+    assert "for pictures, videos and manifests (other files are ignored, models need a manifest)" in said.out
+    assert "files came to rest; sent to the server; packages are named here when they are done\n" in said.out
+    assert "stopped watching; conversions that were sent go on until `dg4d down`\n" in said.err
+
+
 def test_a_slow_server_does_not_count_as_rest(inbox: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock, looks = [0.0], list[float]()
 

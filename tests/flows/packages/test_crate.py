@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from made_package import MACHINE, STEPS, WEIGHTS, made_package, record_in
 from rocrate.rocrate import ROCrate
 from signing import identity
 
-from flows.packages.crate import CRATE, crate_digest, crate_text, files_in, project_url, render_crate
+from flows.packages.crate import CRATE, crate_digest, crate_text, files_in, project_url, render_crate, stated_digest
 
 ADA = "https://orcid.org/0000-0002-1825-0097"
 TIME = re.compile(r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}\.\d{3}\+\d{2}:\d{2}")
@@ -218,10 +219,36 @@ def test_equal_runs_give_equal_crates(folder: Path, tmp_path: Path) -> None:
 
 def test_a_crate_names_its_own_digest(folder: Path) -> None:
     crate = document(folder)
-    assert crate["@graph"][0]["sha256"] == crate_digest(crate)
+    assert stated_digest(crate) == crate_digest(crate)
     assert render_crate(crate) == (folder / CRATE).read_text()
     crate["@graph"][1]["name"] = "blue fox"
-    assert crate["@graph"][0]["sha256"] != crate_digest(crate)
+    assert stated_digest(crate) != crate_digest(crate)
+
+
+def test_every_sha256_of_a_file_is_that_of_its_content(folder: Path) -> None:
+    stated = {entity["@id"]: entity["sha256"] for entity in document(folder)["@graph"] if "sha256" in entity}
+    files = {name: folder / unquote(name) for name in stated if (folder / unquote(name)).is_file()}
+    assert "asset.glb" in files
+    assert {name: stated[name] for name in files} == {
+        name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()
+    }
+
+
+def test_a_crate_of_an_earlier_version_states_its_digest_in_its_descriptor(folder: Path) -> None:
+    crate = document(folder)
+    first, *others = crate["@graph"]
+    del first["identifier"]
+    crate["@graph"] = [first, *(entity for entity in others if not entity["@id"].startswith("#sha256-of-this"))]
+    first["sha256"] = crate_digest(crate)
+    assert stated_digest(crate) == crate_digest(crate)
+    first["sha256"] = "0" * 64
+    assert stated_digest(crate) != crate_digest(crate)
+
+
+def test_no_field_beside_the_stated_digest_is_left_out_of_it(folder: Path) -> None:
+    crate = document(folder)
+    crate["@graph"][0]["sha256"] = "0" * 64
+    assert stated_digest(crate) != crate_digest(crate)
 
 
 def test_a_package_without_weights_says_so_and_names_no_license_of_a_model(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from made_package import WEIGHTS, made_package, record_in
 from signing import Identity, identity
 
 from dg4d_lib.errors import BadInput
-from flows.packages.crate import CRATE, crate_digest, render_crate
-from flows.packages.publish import bytes_digest
+from flows.packages.crate import CRATE, OWN_DIGEST, crate_digest, render_crate
+from flows.packages.publish import bytes_digest, load_verified
 from flows.packages.verify import Verification, verify
 
 
@@ -104,7 +104,8 @@ def with_new_crate(package: Path, change: Callable[[dict[str, Any]], None]) -> N
     fact = bytes_digest(text.encode())
     (entity,) = [entity for entity in crate["@graph"] if entity["@id"] == "provenance.json"]
     entity |= {"sha256": fact["digest"].removeprefix("sha256:"), "contentSize": str(fact["size_bytes"])}
-    crate["@graph"][0]["sha256"] = crate_digest(crate)
+    (own,) = [entity for entity in crate["@graph"] if entity["@id"] == OWN_DIGEST]
+    own["value"] = crate_digest(crate)
     (package / CRATE).write_text(render_crate(crate))
 
 
@@ -135,6 +136,14 @@ def test_a_record_of_another_version_is_named_as_that(package: Path) -> None:
     (package / "provenance.json").write_text(json.dumps({**record, "format": 1}))
     with pytest.raises(BadInput, match="of format 1; this version checks format 2"):
         verify(package)
+
+
+def test_a_path_that_is_no_folder_is_refused_with_what_to_give(package: Path, tmp_path: Path) -> None:
+    for check in (verify, load_verified):
+        with pytest.raises(BadInput, match=r"nowhere does not exist; give a folder that `dg4d make` wrote"):
+            check(tmp_path / "nowhere")
+        with pytest.raises(BadInput, match=rf"asset\.glb is a file; give its folder {re.escape(str(package))}$"):
+            check(package / "asset.glb")
 
 
 def test_a_folder_without_a_package_is_refused(tmp_path: Path) -> None:

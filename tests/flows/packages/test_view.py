@@ -130,7 +130,7 @@ def test_many_faults_are_counted(package: Path) -> None:
 
 
 def test_a_folder_that_is_no_package_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is not an asset"):
+    with pytest.raises(BadInput, match="nowhere does not exist"):
         view(tmp_path / "nowhere", open_browser=False)
 
 

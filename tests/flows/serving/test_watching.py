@@ -150,7 +150,7 @@ def test_a_folder_that_vanishes_during_a_look_is_left_out(folder: Path, monkeypa
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is not a folder"):
+    with pytest.raises(BadInput, match="nothing does not exist; give a folder"):
         watcher(tmp_path / "nothing")
 
 
