@@ -77,14 +77,14 @@ def render_package(
         size: pixels of a side, 16 to 4096.
         frames: number of pictures, evenly spaced from the first to the last frame of the fit; None: one per frame.
         mesh: render the textured mesh instead of the splats.
-        out: folder, made if necessary. Pictures of the same name are replaced, those of later frames in the same views
-            are removed.
+        out: folder, made if necessary; pictures of the same name are replaced.
         rasterizer: name of the rasterizer for splats.
         fit: take the field of view that holds the whole asset from all sides (`whole_fov_y_deg` of the manifest)
             instead of that of the input picture.
 
     Raises:
-        BadInput: the folder is no package, a broken one, or too old for `fit`, or a number is out of range.
+        BadInput: the folder is no package, a broken one, or too old for `fit`, a number is out of range, or a view
+            holds pictures of more frames.
         BackendUnavailable: the rasterizer cannot run here.
         OSError: a picture could not be written.
     """
@@ -99,6 +99,8 @@ def render_package(
     fov_y_deg = _whole_fov_y_deg(folder, manifest) if fit else FOV_Y_DEG
     count, cropped = len(positions), 0
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
+    for view in views:
+        _check_no_later(count, view)
     for view, azimuth_deg in zip(views, azimuths_deg, strict=True):
         view.mkdir(parents=True, exist_ok=True)
         camera = OrbitCamera(elevation_deg, azimuth_deg, fov_y_deg=fov_y_deg, width=size, height=size)
@@ -107,7 +109,6 @@ def render_package(
             for frame, picture in enumerate(draw(part, [camera] * len(part)), start):
                 write_png(view / _file_name(frame), picture)
                 cropped += _touches_edge(picture)
-        _remove_after(count, view)
     return Renders(views, cropped)
 
 
@@ -115,12 +116,15 @@ def _file_name(frame: int) -> str:
     return f"{frame:03d}.png"
 
 
-def _remove_after(count: int, view: Path) -> None:
-    """Remove the pictures that an earlier run with more frames left in a view; other files stay."""
-    for path in view.iterdir():
-        frame = FRAME_FILE.fullmatch(path.name)
-        if frame and int(frame[1]) >= count and path.is_file():
-            path.unlink()
+def _check_no_later(count: int, view: Path) -> None:
+    """Refuse a view that holds pictures of more frames: they would be mixed with the new ones."""
+    numbered = (FRAME_FILE.fullmatch(path.name) for path in view.iterdir()) if view.is_dir() else ()
+    later = sum(1 for frame in numbered if frame and int(frame[1]) >= count)
+    if later:
+        raise BadInput(
+            f"{view} holds {later} picture{'s' * (later != 1)} beyond the {count} of this render; choose another "
+            "folder, or remove them"
+        )
 
 
 def _whole_fov_y_deg(folder: Path, manifest: Manifest) -> float:

@@ -61,17 +61,23 @@ def test_every_view_has_its_folder_and_every_frame_its_picture(package: Path, tm
         assert pictures(view).shape == (FRAMES, SIZE, SIZE, 4)
 
 
-def test_pictures_beyond_the_last_are_removed_and_other_files_stay(package: Path, tmp_path: Path) -> None:
+def test_a_view_with_pictures_of_more_frames_is_refused_and_stays(package: Path, tmp_path: Path) -> None:
+    render(package, tmp_path, (0.0, 90.0))
+    before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.png"))}
+    with pytest.raises(BadInput, match=r"view_90 holds 1 picture beyond the 2 of this render; choose another folder"):
+        render(package, tmp_path, (15.0, 90.0), frames=2)
+    assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.png"))} == before
+
+
+def test_other_files_of_a_view_do_not_matter(package: Path, tmp_path: Path) -> None:
     stay = [tmp_path / "view_0" / name for name in ("notes.txt", "04.png", "0007.png", "x007.png", "007.jpg")]
     stay.append(tmp_path / "view_90" / "007.png")  # of a view that is not written
-    removed = [tmp_path / "view_0" / name for name in ("002.png", "007.png", "1000.png")]
-    for path in (*stay, *removed):
+    for path in stay:
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    (tmp_path / "view_0" / "008.png").mkdir()
     (view,) = render(package, tmp_path, frames=2)
-    assert all(path.exists() for path in stay) and not any(path.exists() for path in removed)
-    assert {"000.png", "001.png", "008.png"} <= {path.name for path in view.iterdir()}
+    assert all(path.exists() for path in stay)
+    assert {"000.png", "001.png"} <= {path.name for path in view.iterdir()}
 
 
 @pytest.mark.parametrize("mesh", [False, True])
