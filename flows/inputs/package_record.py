@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from dg4d_lib.errors import BadInput
+from dg4d_lib.errors import BadInput, quoted
 from flows.inputs.json_text import loads
 from steps.artifacts.archives import can_exist, stays_inside
 from steps.store.files import require_regular
@@ -18,9 +18,15 @@ def check_is_folder(place: Path) -> None:
     Raises:
         BadInput: says what to give instead.
     """
-    if place.is_file():
+    try:
+        is_file, is_folder = place.is_file(), place.is_dir()
+    except OSError as error:  # a name that is too long
+        raise BadInput(
+            f"{quoted(str(place))} cannot be read: {error.strerror}; give a folder that `dg4d make` wrote"
+        ) from error
+    if is_file:
         raise BadInput(f"{place} is a file; give its folder {place.parent}")
-    if not place.is_dir():
+    if not is_folder:
         raise BadInput(f"{place} does not exist; give a folder that `dg4d make` wrote")
 
 
