@@ -18,7 +18,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.cameras.orbit import FOV_Y_DEG, OrbitCamera
 from dg4d_lib.images import over_white
 from dg4d_lib.mesh.render import render_lit
 from dg4d_lib.rasterizer.interface import get_rasterizer
@@ -47,12 +47,14 @@ def write_animation(package: Path, path: Path) -> None:
     manifest = read_manifest(package)
     states, surface = read_states(package, manifest), read_surface(package, manifest)
     draw = get_rasterizer("auto")
-    subject = _over_white(Image.open(package / "input" / "subject.png").resize((SIZE, SIZE), Image.Resampling.LANCZOS))
+    fov_y_deg = manifest.camera.whole_fov_y_deg or FOV_Y_DEG
+    subject = _subject(package, math.tan(math.radians(FOV_Y_DEG / 2)) / math.tan(math.radians(fov_y_deg / 2)))
     count = round(LOOPS * manifest.frames / manifest.fps * FPS)
     pictures = []
     for k in range(count):
         position = torch.tensor([k * LOOPS * manifest.frames / count % manifest.frames], dtype=torch.float64)
-        camera = OrbitCamera(8.0, SWAY_DEG * math.sin(2 * math.pi * k / count), width=SIZE, height=SIZE)
+        sway_deg = SWAY_DEG * math.sin(2 * math.pi * k / count)
+        camera = OrbitCamera(8.0, sway_deg, fov_y_deg=fov_y_deg, width=SIZE, height=SIZE)
         splats = draw(states(position), [camera], torch.ones(3)).color[0]
         mesh = over_white(torch.cat(render_lit(mesh_at(surface, position[0]), camera), -1))
         panels = [np.asarray(subject), _bytes(mesh), _bytes(splats)]
@@ -84,6 +86,15 @@ def write_screenshot(package: Path, path: Path) -> None:
         "screenshot": str(path),
     }
     subprocess.run(["node", str(script), json.dumps(wanted)], check=True)
+
+
+def _subject(package: Path, scale: float) -> Image.Image:
+    """Return the cut-out of the input, its frame at a share of the panel's side, on white."""
+    side = round(scale * SIZE)
+    panel = Image.new("RGB", (SIZE, SIZE), "white")
+    cutout = Image.open(package / "input" / "subject.png").resize((side, side), Image.Resampling.LANCZOS)
+    panel.paste(_over_white(cutout), ((SIZE - side) // 2, (SIZE - side) // 2))
+    return panel
 
 
 def _over_white(picture: Image.Image) -> Image.Image:
