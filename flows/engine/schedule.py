@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flows import home
 from flows.engine.events import StepEvent
+from flows.inputs.json_text import read_object
 from steps.store.files import write_atomically
 
 USUAL_S: Mapping[str, float] = {  # seconds of the profile `preview` on two cores; only their ratios count
@@ -130,7 +131,7 @@ class Schedule:
 
 def load_durations(profile: str) -> dict[str, float]:
     """Return the seconds of the steps in the latest conversion of a profile on this machine; empty if unknown."""
-    known = _read(durations_file()).get(profile)
+    known = read_object(durations_file()).get(profile)
     if not isinstance(known, dict):
         return {}
     return {name: float(value) for name, value in known.items() if _is_duration(value)}
@@ -141,7 +142,7 @@ def keep_durations(profile: str, seconds: Mapping[str, float]) -> None:
     if not seconds:
         return
     path = durations_file()
-    known = _read(path)
+    known = read_object(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps({**known, profile: {**load_durations(profile), **seconds}}, indent=1) + "\n")
 
@@ -179,14 +180,6 @@ def _pace(worked: Iterable[tuple[float, float]]) -> float:
         if half <= 0:
             return ratio
     return 1.0
-
-
-def _read(path: Path) -> dict[str, object]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _is_duration(value: object) -> bool:

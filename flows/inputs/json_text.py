@@ -2,9 +2,11 @@
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import quoted
+from steps.store.files import require_regular
 
 DEEPEST = 100  # nested brackets; a provenance record has about ten
 MOST_DIGITS = 100  # of an integer; Python itself refuses more than 4300
@@ -29,6 +31,16 @@ def loads(text: str) -> Any:
         raise UnfitJSON(f"brackets are nested more than {DEEPEST} deep") from None
     _check(value)
     return value
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file; empty if there is no such file, or it holds something else."""
+    try:
+        require_regular(path)
+        content = loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

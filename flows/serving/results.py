@@ -1,15 +1,13 @@
 """Results in the output folder of a watched folder: lines for packages that appear, and for failures."""
 
-import json
 import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from dg4d_lib.errors import BadInput
 from flows.formatting.escaping import visible
-from steps.store.files import require_regular
+from flows.inputs.json_text import read_object
 
 RECORD = "provenance.json"  # of a package
 REPORT = "report.json"
@@ -48,14 +46,14 @@ class Results:
 
     def _failed(self) -> dict[str, str]:
         """Return the messages of failed items in the summary."""
-        rows = _read(self.out / SUMMARY).get("items")
+        rows = read_object(self.out / SUMMARY).get("items")
         if not isinstance(rows, list):
             return {}
         failed = [row for row in rows if isinstance(row, dict) and row.get("status") == "failed"]
         return {str(row.get("item")): str(row.get("message", "")) for row in failed}
 
     def _verdict(self, name: str) -> str:
-        acceptance = _read(self.out / name / REPORT).get("acceptance")
+        acceptance = read_object(self.out / name / REPORT).get("acceptance")
         failing = acceptance.get("failing") if isinstance(acceptance, dict) else None
         return f" (not accepted: {', '.join(map(str, failing))})" if isinstance(failing, list) and failing else ""
 
@@ -81,12 +79,3 @@ def visible_files(folder: Path) -> Iterator[Path]:
     for parent, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         yield from (Path(parent, name) for name in names if not name.startswith("."))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        require_regular(path)
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}

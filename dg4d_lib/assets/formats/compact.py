@@ -93,6 +93,8 @@ def read_compact(path: Path) -> CompactAsset:
     Raises:
         BadInput: the file is missing, corrupt or of another format.
     """
+    if not path.is_file():  # reading a FIFO may never end
+        raise BadInput(f"{path.name} is not a compact asset (no such file); pack the asset again")
     try:
         with safe_open(path, "pt") as file:
             about: dict[str, Any] = json.loads((file.metadata() or {})[KEY])

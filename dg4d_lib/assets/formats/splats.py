@@ -57,6 +57,8 @@ def read_splats(folder: Path, *, y_down: bool = True) -> Gaussians:
     if not paths or [path.name for path in paths] != [f"{frame:03d}.ply" for frame in range(len(paths))]:
         given = f"{paths[0].name} to {paths[-1].name}, {len(paths)} files" if paths else "none"
         raise BadInput(f"{folder.name}/ must contain 000.ply, 001.ply, ... without gaps; given {given}")
+    if others := [path.name for path in paths if not path.is_file()]:  # reading a FIFO may never end
+        raise BadInput(f"{folder.name}/{others[0]} is not a file; pack the asset again")
     clouds = [read_ply(path, y_down=y_down) for path in paths]
     first = clouds[0]
     for path, cloud in zip(paths, clouds, strict=True):

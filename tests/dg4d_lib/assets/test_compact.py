@@ -1,6 +1,7 @@
 """Compact format: lossless round trip, self-description, corrupt files."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,3 +99,9 @@ def test_another_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(content.replace(b'\\"version\\": 1', b'\\"version\\": 2'))
     with pytest.raises(BadInput, match="this program reads dg4d-compact version 1"):
         read_compact(tmp_path / "a")
+
+
+def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "asset4d.safetensors")
+    with pytest.raises(BadInput, match=r"asset4d\.safetensors is not a compact asset"):
+        read_compact(tmp_path / "asset4d.safetensors")

@@ -1,5 +1,6 @@
 """Splat sequences: standard PLY per frame, round trip."""
 
+import os
 from pathlib import Path
 
 import gsply
@@ -64,4 +65,10 @@ def test_a_foreign_frame_is_refused(tmp_path: Path, states: Gaussians) -> None:
     stranger = Gaussians(first.means, first.log_scales, first.quats, first.opacity_logits + 1, first.harmonics)
     write_ply(tmp_path / "001.ply", stranger)
     with pytest.raises(BadInput, match=r"001\.ply and 000\.ply are not frames of one sequence"):
+        read_splats(tmp_path)
+
+
+def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "000.ply")
+    with pytest.raises(BadInput, match=r"000\.ply is not a file"):
         read_splats(tmp_path)

@@ -1,8 +1,10 @@
 import json
+import os
+from pathlib import Path
 
 import pytest
 
-from flows.inputs.json_text import DEEPEST, UnfitJSON, loads
+from flows.inputs.json_text import DEEPEST, UnfitJSON, loads, read_object
 
 
 def nested(depth: int) -> str:
@@ -33,3 +35,16 @@ def test_what_is_no_json_is_another_error(text: str) -> None:
     with pytest.raises(json.JSONDecodeError) as refused:
         loads(text)
     assert not isinstance(refused.value, UnfitJSON)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", '{"a": NaN}', "\udcff", "[" * 10_000])
+def test_a_file_without_an_object_counts_as_empty(tmp_path: Path, text: str) -> None:
+    (tmp_path / "file.json").write_bytes(text.encode(errors="surrogateescape"))
+    assert read_object(tmp_path / "file.json") == {}
+
+
+def test_objects_are_read_from_regular_files_alone(tmp_path: Path) -> None:
+    (tmp_path / "file.json").write_text('{"a": 1}')
+    os.mkfifo(tmp_path / "fifo.json")
+    assert read_object(tmp_path / "file.json") == {"a": 1}
+    assert read_object(tmp_path / "fifo.json") == read_object(tmp_path / "gone.json") == {}
