@@ -91,10 +91,11 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
         console.print(f"note: {sentence}", markup=False)
     check_folder(folder, item, wish.force)
     with stored(request) as job:
-        named = (record_of(folder) or {}).get("item", item)  # `--force` replaces the asset of another name
+        before = record_of(folder) or {}
+        named = before.get("item", item)  # `--force` replaces the asset of another name
         up_to_date = cached = named == item and is_up_to_date(folder, job.digest())
         if not up_to_date:
-            if named == item and (record_of(folder) or {}).get("source", job.source.digest) != job.source.digest:
+            if named == item and before.get("source", job.source.digest) != job.source.digest:
                 console.print(
                     f"note: {folder} holds the asset {item} of another source; it is replaced (the store keeps the "
                     "earlier version); -o chooses another folder",

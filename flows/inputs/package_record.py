@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from dg4d_lib.errors import BadInput, quoted
-from flows.inputs.json_text import loads
+from flows.inputs.json_text import read_object
 from steps.artifacts.archives import can_exist, stays_inside
-from steps.store.files import require_regular
 
 RECORD = "provenance.json"
 FORMAT = 2  # of the record
@@ -36,11 +35,10 @@ def record_of(folder: Path) -> dict[str, Any] | None:
     None if there is no package, or the record cannot be used: a name in it leads out of the folder or is too long for
     a file, or it is nested too deeply.
     """
+    record = read_object(folder / RECORD)
     try:
-        require_regular(folder / RECORD)
-        record = loads((folder / RECORD).read_text(encoding="utf-8"))
         names = [*record["files"], *record.get("beside", ())]
         sound = isinstance(record["files"], dict) and all(stays_inside(name) and can_exist(name) for name in names)
         return record if sound else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return None
