@@ -239,7 +239,7 @@ def test_an_interrupt_ends_every_process_and_the_next_run_works(
     with pytest.raises(InterruptProcessingException):
         comfy.execute(prompt(seed=7))
     comfy.interrupt_when = lambda: False
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while (left := processes_with("COMFY_NODES_TEST=interrupt")) and time.monotonic() < until:
         time.sleep(0.1)
     assert not left
@@ -316,7 +316,7 @@ def test_a_child_that_ignores_the_interrupt_is_killed(
 
     with pytest.raises(InterruptProcessingException):
         module.call({"call": "make", "arguments": {}}, lambda event: None, check, python=python)
-    assert time.monotonic() - before < 10
+    assert time.monotonic() - before < 40
 
 
 def test_masks_of_another_size_or_number_are_refused(comfy: Comfy) -> None:

@@ -273,7 +273,7 @@ def start(folder: Path, *arguments: str, survives: bool = False) -> subprocess.P
 
 def left_behind(folder: Path) -> list[str]:
     """List what an ended command has left: steps at work, temporary files, scratch folders, locks that are held."""
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while steps_of(folder) and time.monotonic() < deadline:  # what was killed takes a moment to go
         time.sleep(0.1)
     left = [f"process {pid}" for pid in steps_of(folder)]

@@ -38,9 +38,9 @@ def test_a_signal_whose_exception_was_swallowed_is_raised_again() -> None:
     with ends_with(EXIT_TERMINATED), endings.exit_on_error():
         with pytest.raises(KeyboardInterrupt):  # stands for a finalizer, which swallows what it raises
             os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(10)
-        time.sleep(10)
-    assert time.monotonic() - began < 5
+            time.sleep(60)
+        time.sleep(60)
+    assert time.monotonic() - began < 30
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 

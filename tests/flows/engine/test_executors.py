@@ -115,7 +115,7 @@ def test_a_step_that_takes_too_long_is_stopped(place: Path, execute: Execute) ->
     start = time.monotonic()
     with pytest.raises(StepTimedOut, match=r"no result after 1\.5 s"):
         execute(spec.model_copy(update={"timeout_s": 1.5}), request, ignore, ignore)
-    assert time.monotonic() - start < 20
+    assert time.monotonic() - start < 50
     assert _steps_of(place) == []
     assert list((place / "home" / "scratch").iterdir()) == []
 
@@ -127,7 +127,7 @@ def test_a_step_is_killed_when_the_command_is(place: Path, execute: Execute) -> 
     (child,) = _steps_of(place)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while child in _processes() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert child not in _processes()
@@ -219,7 +219,7 @@ def _command(place: Path, execute: Execute, words: str, *before: str) -> "subpro
 
 
 def _wait_for(path: Path) -> None:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while not path.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
 

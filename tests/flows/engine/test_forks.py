@@ -61,16 +61,16 @@ def begin(server: ForkServer, begun: list[Fork], place: Path, words: str) -> For
 def test_steps_run_side_by_side_and_each_has_its_own_status(place: Path, server: ForkServer, begun: list[Fork]) -> None:
     words = ["prepare_subject=sleep:1.5", "fine", "prepare_subject=bad:torn", "prepare_subject=die"]
     slow, *quick = [begin(server, begun, place, text) for text in words]
-    assert [process.wait(20) for process in quick] == [0, 65, -signal.SIGKILL]
+    assert [process.wait(60) for process in quick] == [0, 65, -signal.SIGKILL]
     assert slow.poll() is None
-    assert slow.wait(20) == 0 and slow.poll() == 0
+    assert slow.wait(60) == 0 and slow.poll() == 0
     assert (place / "prepare_subject=sleep:1.5.out").exists()
 
 
 def test_a_step_is_a_process_group_of_its_own(place: Path, server: ForkServer, begun: list[Fork]) -> None:
     one, other = (begin(server, begun, place, f"prepare_subject=sleep:{30 + number}") for number in range(2))
     os.killpg(one.pid, signal.SIGKILL)
-    assert one.wait(20) == -signal.SIGKILL
+    assert one.wait(60) == -signal.SIGKILL
     time.sleep(0.1)
     assert other.poll() is None
 
@@ -80,7 +80,7 @@ def test_steps_end_with_their_server_and_the_server_begins_no_more(
 ) -> None:
     process = begin(server, begun, place, "prepare_subject=sleep:30")
     server.end()
-    assert process.wait(20) == -signal.SIGKILL
+    assert process.wait(60) == -signal.SIGKILL
     wait_until(lambda: not Path(f"/proc/{process.pid}/stat").exists())
     with (place / "stderr").open("ab") as stderr:
         assert server.fork([], {}, stderr, []) is None
@@ -100,7 +100,7 @@ def test_a_step_holds_what_it_is_given_and_prints_where_it_is_told(
     os.close(writing)
     assert os.read(reading, 1) == b""  # the pipe ends when the last process that holds it has ended
     os.close(reading)
-    assert process.wait(20) == 65
+    assert process.wait(60) == 65
     assert "is not a StepRequest" in (place / "stderr").read_text()
     assert process.stdout.read() == ""
 
@@ -117,7 +117,7 @@ def test_the_next_step_is_a_fork_of_the_same_process_and_one_for_another_environ
             number = None
             with suppress(OSError):  # a step without arguments ends at once, at times before it is looked at
                 number = int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[1])
-            process.wait(20)
+            process.wait(60)
             if number is not None:
                 return number
         raise AssertionError("no process was seen")
@@ -147,7 +147,7 @@ def test_a_step_goes_on_when_the_environment_changes_and_its_server_ends_with_it
         monkeypatch.setenv("DG4D_STORE", str(place / "elsewhere"))
         assert forks._server().process is not server
         assert server.poll() is None
-        assert step.result(20).outputs
+        assert step.result(60).outputs
     del step
     wait_until(lambda: server.poll() is not None)
 

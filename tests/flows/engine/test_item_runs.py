@@ -122,7 +122,7 @@ def test_a_crashed_run_is_waited_for_until_the_server_would_have_begun_it_again(
     time.sleep(0.5)
     assert waiting.is_alive()
     monkeypatch.setattr(item_runs, "CRASHED_S", 0.1)
-    waiting.join(10)
+    waiting.join(60)
     assert ended[0].state is not None and ended[0].state.is_crashed()
     assert item_runs._outcome_of(ended[0], home.store()).may_heal
     client.set_flow_run_state(run.id, Cancelled(), force=True)

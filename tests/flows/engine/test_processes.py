@@ -71,9 +71,9 @@ def test_a_signal_whose_exception_was_swallowed_is_sent_again(handler: Callable[
     with pytest.raises(Told), repeated(signal.SIGUSR1):
         with pytest.raises(Told):  # stands for a finalizer, which swallows what it raises
             os.kill(os.getpid(), signal.SIGUSR1)
-            time.sleep(10)
-        time.sleep(10)
-    assert time.monotonic() - began < 5
+            time.sleep(60)
+        time.sleep(60)
+    assert time.monotonic() - began < 30
     assert signal.getsignal(signal.SIGUSR1) is handler
 
 

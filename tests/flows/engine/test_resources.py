@@ -42,13 +42,13 @@ def all_at_once(*work: Callable[[], None]) -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(60)
         assert not thread.is_alive(), "it waits for ever"
 
 
 def are_inside(resource: Resource, count: int) -> None:
     """Of twice as many users, exactly so many are inside at a time: they meet there, and there never are more."""
-    meeting = threading.Barrier(count, timeout=20)
+    meeting = threading.Barrier(count, timeout=60)
     inside, most, mutex = 0, 0, threading.Lock()
 
     def use() -> None:
@@ -82,7 +82,7 @@ def test_the_processor_has_as_many_turns_as_it_is_told(monkeypatch: pytest.Monke
 
 
 def test_a_step_on_the_processor_runs_beside_one_on_a_gpu() -> None:
-    both_inside = threading.Barrier(2, timeout=10)
+    both_inside = threading.Barrier(2, timeout=60)
 
     def use(resource: Resource) -> Callable[[], None]:
         def inside() -> None:
@@ -114,11 +114,11 @@ def test_a_gpu_is_taken_until_the_process_of_its_step_has_ended() -> None:
 
     thread = threading.Thread(target=next_step)
     thread.start()
-    assert waited.wait(10)
+    assert waited.wait(60)
     assert not got.wait(0.3)
     step.kill()
     step.wait()
-    assert got.wait(10)
+    assert got.wait(60)
     thread.join()
     assert step.stdin is not None
     step.stdin.close()
@@ -127,7 +127,7 @@ def test_a_gpu_is_taken_until_the_process_of_its_step_has_ended() -> None:
 def test_steps_on_two_gpus_see_one_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-a1, GPU-b2")
     seen: set[str] = set()
-    both_inside = threading.Barrier(2, timeout=10)
+    both_inside = threading.Barrier(2, timeout=60)
 
     def use() -> None:
         with slot("gpu", silent):
@@ -210,14 +210,14 @@ def test_turns_are_taken_in_the_order_in_which_items_were_begun_and_then_of_aski
 
         thread = threading.Thread(target=work)
         thread.start()
-        assert asked.wait(10)
+        assert asked.wait(60)
         return thread
 
     with slot("cpu", silent, Turn(9, "the one at work")):
         waiting = [use(begun_ns, name) for begun_ns, name in ((5, "b1"), (7, "c"), (5, "b2"), (3, "a"))]
         time.sleep(0.2)
     for thread in waiting:
-        thread.join(20)
+        thread.join(60)
     assert served == ["a", "b1", "b2", "c"]
     assert told[0].endswith("behind the one at work") and told[1].endswith("behind b1")
     assert list((tmp_path / "home" / "slots" / "queue-cpu").iterdir()) == []

@@ -299,7 +299,7 @@ def test_a_server_that_sends_a_byte_now_and_then_ends_at_the_limit(
     site.drip_s, site.says_length = drip_s, says_length
     begun = time.monotonic()
     refused(at(site, "/slow.png"), r"it took more than 0\.5 s")
-    assert time.monotonic() - begun < 5  # no byte was late; all of them would take minutes
+    assert time.monotonic() - begun < 60  # no byte was late; all of them would take minutes
 
 
 def test_a_server_that_says_nothing_during_a_handshake_ends_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ def test_a_server_ends_when_nobody_has_used_it_for_a_while(
         watch.start()
         time.sleep(0.8)
         assert lasting.poll() is None
-    watch.join(10)
+    watch.join(60)
     assert lasting.poll() is not None
 
 
@@ -42,7 +42,7 @@ def test_a_server_that_is_kept_stays(
     time.sleep(0.6)
     assert lasting.poll() is None
     assert not Server(tmp_path, tmp_path).stop()  # takes the mark away; there is no guard here to end
-    watch.join(10)
+    watch.join(60)
     assert lasting.poll() is not None
 
 

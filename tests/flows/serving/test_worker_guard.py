@@ -53,6 +53,6 @@ def test_a_worker_that_is_stopped_has_time_to_end_and_leaves_no_run(
     run = int((tmp_path / "run").read_text())
     assert start_of(run)
     assert Worker("pool", tmp_path).stop()
-    assert guard.wait(5) == 0
+    assert guard.wait(60) == 0
     assert (tmp_path / "ended").exists()
     wait_until(lambda: not start_of(run))

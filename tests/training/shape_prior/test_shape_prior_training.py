@@ -374,7 +374,7 @@ if __name__ == "__main__":
         assert trainer.stdout is not None
         worker = int(trainer.stdout.readline())
         trainer.kill()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
