@@ -22,7 +22,7 @@ NAMES = ("nothing", "turn", "layers", "inverse depth", "noisy inverse depth", "d
 
 
 def sample_depth(sample: Sample) -> Float[Tensor, "s s"]:
-    """Return the distance of the first surface of a made-up shape from the camera's plane; 0 where there is none."""
+    """Return the distance of the first surface of a synthetic shape from the camera's plane; 0 where there is none."""
     size = len(sample.picture)
     depth = np.zeros(size * size, np.float32)
     depth[sample.pixels] = NEAR + sample.depths[:, 0].astype(np.float32) / 65535 * (FAR - NEAR)
@@ -60,10 +60,10 @@ def hints_of(depth: Float[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> dict[s
     exact = DepthField(torch.from_numpy(np.where(inside, truth, 0)).float(), known, DISTANCE_SIGMA)
     fields = {
         "layers": layer_field(levels, known, alpha),
-        "inverse depth": depth_field(1 / depth.clamp(min=0.1), known, alpha, "inverse"),
-        "noisy inverse depth": depth_field(1 / noisy, known, alpha, "inverse"),
-        "distances": depth_field(depth, known, alpha, "distance"),
-        "noisy distances": depth_field(noisy, known, alpha, "distance"),
+        "inverse depth": depth_field(1 / depth.clamp(min=0.1), known.float(), alpha, "inverse"),
+        "noisy inverse depth": depth_field(1 / noisy, known.float(), alpha, "inverse"),
+        "distances": depth_field(depth, known.float(), alpha, "distance"),
+        "noisy distances": depth_field(noisy, known.float(), alpha, "distance"),
         "place": exact,
     }
     found = {"nothing": DepthHint(), "turn": DepthHint(turn_deg)} | {k: DepthHint(None, f) for k, f in fields.items()}

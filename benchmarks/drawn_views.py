@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--perfect", action="store_true", help="views without errors")
     parser.add_argument("--spoil", type=int, default=0, metavar="N", help="views that are turned upside down")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
-    parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the true ones")
+    parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the ground truth")
     given = parser.parse_args(arguments)
     min_weight = getattr(profile("open").views, "min_weight", 0.0)
     changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}

@@ -59,7 +59,7 @@ class Way:
 
 def pictures_of(subject: Subject, azimuths: Sequence[float], scratch: Path) -> Given:
     """Return pictures of frame 0 from other sides."""
-    assert subject.truth is not None, "made-up subjects have no files"
+    assert subject.truth is not None, "synthetic subjects have no files"
     folder = subject.truth.inputs[0].parents[1] / "static"
     names = [f"az_{azimuth:03.0f}.png" for azimuth in azimuths]
     views = [GivenView(file=name, name=name, azimuth=azimuth) for name, azimuth in zip(names, azimuths, strict=True)]
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--azimuths", type=float, nargs="+", default=AZIMUTHS_DEG, help="of the pictures of --views")
     parser.add_argument("--first", action="store_true", help="score the shape of frame 0 alone, without a fit")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
-    parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the true ones")
+    parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the ground truth")
     parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each --asset")
     given = parser.parse_args(arguments)
     changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}

@@ -1,7 +1,7 @@
 """Quality of `--asset`: true meshes of the first frame, driven by their videos, beside the frozen truth.
 
     python -m benchmarks.own_asset FOLDER [--only panda mage] [--sheets DIR]
-    python -m benchmarks.own_asset --made-up
+    python -m benchmarks.own_asset --synthetic
 
 FOLDER has a folder per object with `input/`, `view_AZIMUTH/`, `bank/` and `mesh.npz`. The model of an object is its
 mesh of frame 0, with colors baked from frame 0 of the bank; its place is searched as for any model.
@@ -86,7 +86,7 @@ def read_models(folder: Path, names: Sequence[str] = ()) -> Iterator[OwnModel]:
         yield OwnModel(subject, baked_model(vertices[0], faces, truth.bank), vertices, faces, weights)
 
 
-def made_up_models(frames: int, names: Sequence[str] = ()) -> Iterator[OwnModel]:
+def synthetic_models(frames: int, names: Sequence[str] = ()) -> Iterator[OwnModel]:
     """Draw our own objects, for tuning."""
     azimuths = (-75.0, 15.0, 105.0, 195.0)
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0.0, *azimuths)]
@@ -268,13 +268,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--only", nargs="+", default=(), help="names of objects")
-    parser.add_argument("--made-up", action="store_true", help="our own objects instead")
+    parser.add_argument("--synthetic", action="store_true", help="our own objects instead")
     parser.add_argument("--frames", type=int, default=16, help="of our own objects")
     parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each")
     given = parser.parse_args(arguments)
-    if given.folder is None and not given.made_up:
-        parser.error("give a folder, or --made-up")
-    models = made_up_models(given.frames, given.only) if given.made_up else read_models(given.folder, given.only)
+    if given.folder is None and not given.synthetic:
+        parser.error("give a folder, or --synthetic")
+    models = synthetic_models(given.frames, given.only) if given.synthetic else read_models(given.folder, given.only)
     found = measure(models, PREVIEW.asset, write_line, given.sheets)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1))

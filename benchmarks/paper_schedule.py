@@ -15,7 +15,7 @@ is downloaded. `--quick` is a smoke test with tiny networks on any device; its t
 import gc
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any
 
@@ -338,8 +338,7 @@ def ball(texture: int, device: torch.device) -> TexturedMesh:
     below = corner + columns
     faces = torch.cat([torch.stack([corner, below, below + 1], -1), torch.stack([corner, below + 1, corner + 1], -1)])
     gray = torch.full((texture, texture, 3), 0.5)
-    mesh = TexturedMesh(0.5 * vertices, faces, torch.stack([u, v], -1), gray)
-    return replace(mesh, **{name: value.to(device) for name, value in vars(mesh).items()})
+    return TexturedMesh(*(value.to(device) for value in (0.5 * vertices, faces, torch.stack([u, v], -1), gray)))
 
 
 def main() -> None:

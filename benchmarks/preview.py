@@ -24,7 +24,7 @@ from benchmarks.measure import machine, new_console, parser_of, write_rows
 from flows.inputs.package_record import RECORD
 
 HERE = Path(__file__).resolve().parents[1]
-FIRST_LOOK = "First look"  # begins the line that names the page of the static splats
+FIRST_LOOK = "Preview of the static splats"  # begins the line that names the page of the static splats
 TO_FIRST_LOOK, TO_PACKAGE = "command to first look", "command to package"
 WITHOUT = (
     "static.viewpoints=0",

@@ -2,8 +2,8 @@
 
     python -m benchmarks.prior FOLDER --frames 0 16 --sheet sheet.png
     python -m benchmarks.prior FOLDER --video
-    python -m benchmarks.prior --made-up 60
-    python -m benchmarks.prior --made-up 40 --hints
+    python -m benchmarks.prior --synthetic 60
+    python -m benchmarks.prior --synthetic 40 --hints
     python -m benchmarks.prior --pictures examples/newt.png examples/beetle.png --sheet sheet.png
 
 FOLDER has a folder per object with cut-outs `input/NNN.png` and `view_AZIMUTH/NNN.png`, all taken at elevation 0.
@@ -47,16 +47,16 @@ from steps.fitting.priors import subject_shapes
 from steps.profiles import PREVIEW, PipelineSettings, revise
 from training.shape_prior.samples import make_views
 
-MADE_UP_SEED = 991  # no training run uses it
+SYNTHETIC_SEED = 991  # no training run uses it
 AZIMUTHS_DEG = (-75.0, 15.0, 105.0, 195.0)
 KINDS = ("geometric", "learned")
 SHEET, SHEET_ELEVATION_DEG = 256, 10.0  # pixels of a panel and elevation of the cameras in a sheet of surfaces
 
 
-def made_up_subjects(count: int) -> Iterator[Subject]:
+def synthetic_subjects(count: int) -> Iterator[Subject]:
     """Make subjects of one frame up, for tuning."""
     for index in range(count):
-        sample, views = make_views(MADE_UP_SEED, index, AZIMUTHS_DEG)
+        sample, views = make_views(SYNTHETIC_SEED, index, AZIMUTHS_DEG)
         pictures = torch.from_numpy(np.concatenate([sample.picture[None].astype(np.float32) / 255, views]))
         straight = torch.cat([pictures[..., :3] / pictures[..., 3:].clamp(min=1e-3), pictures[..., 3:]], -1).clamp(0, 1)
         known = zip(AZIMUTHS_DEG, straight[1:, None], strict=True)
@@ -155,18 +155,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("objects", type=Path, nargs="?", help="folder of objects")
     parser.add_argument("--only", nargs="+", default=(), help="names of objects")
-    parser.add_argument("--made-up", type=int, default=0, metavar="N", help="made-up shapes instead of a folder")
+    parser.add_argument("--synthetic", type=int, default=0, metavar="N", help="synthetic shapes instead of a folder")
     parser.add_argument("--kinds", nargs="+", default=KINDS, help="values of prior.kind")
     parser.add_argument("--frames", type=int, nargs="+", default=(0,), help="frames of which priors are compared")
-    parser.add_argument("--hints", action="store_true", help="what true turns, layers and depths bring, means")
+    parser.add_argument(
+        "--hints", action="store_true", help="mean scores with hints from ground truth: yaw, layers and depth"
+    )
     parser.add_argument("--video", action="store_true", help="fit Gaussians and motion with the profile preview")
     parser.add_argument("--weights", type=Path, help="network instead of the shipped one")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, for all kinds")
-    parser.add_argument("--pictures", type=Path, nargs="+", help="PNG cut-outs whose guessed surfaces are drawn")
+    parser.add_argument("--pictures", type=Path, nargs="+", help="PNG cut-outs whose guessed surfaces are rendered")
     parser.add_argument("--sheet", type=Path, help="picture: input, truth, and the views of every kind")
     given = parser.parse_args(arguments)
-    if sum((given.objects is not None, given.made_up > 0, given.pictures is not None)) != 1:
-        parser.error("give a folder of objects, --made-up N or --pictures FILE ...")
+    if sum((given.objects is not None, given.synthetic > 0, given.pictures is not None)) != 1:
+        parser.error("give a folder of objects, --synthetic N or --pictures FILE ...")
     if given.pictures and not given.sheet:
         parser.error("--pictures needs --sheet FILE")
     if given.weights:
@@ -177,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.pictures:
         compare_surfaces(given.pictures, given.kinds, values, given.sheet)
         return
-    subjects = made_up_subjects(given.made_up) if given.made_up else read_subjects(given.objects, given.only)
+    subjects = synthetic_subjects(given.synthetic) if given.synthetic else read_subjects(given.objects, given.only)
     if given.hints:
         scored, strips = compare_hints(subjects, given.kinds, values, given.frames)
         if given.json:

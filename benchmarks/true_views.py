@@ -49,7 +49,7 @@ class Subject:
         name: of the object.
         footage: cut-outs, straight alpha.
         views: azimuth to cut-outs.
-        truth: files of the object; None for made-up ones.
+        truth: files of the object; None for synthetic ones.
         depth: distance of the first frame's surface from the camera's plane, 0 where there is none; None: unknown.
     """
 

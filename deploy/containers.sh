@@ -1,10 +1,13 @@
 #!/usr/bin/env bash
 # Builds the images of deploy/images with docker, else with podman.
 #
-#   deploy/containers.sh build [cpu|cuda|flows ...] [-- ARGUMENT ...]   dg4d/NAME; default: cpu flows
-#   deploy/containers.sh base                                           dg4d/python, a base image out of Debian's own
-#                                                                       packages, where no registry can be reached;
-#                                                                       then build with -- --build-arg PYTHON=dg4d/python
+#   deploy/containers.sh build [NAME ...] [-- ARGUMENT ...]   builds images; default: cpu flows
+#       cpu, cuda      dg4d/cpu, dg4d/cuda: the steps
+#       flows          dg4d/flows: server, workers and runs; needs dg4d/cpu
+#       flows-cuda     dg4d/flows:cuda: the same for GPUs; needs dg4d/cuda
+#   deploy/containers.sh base                                 dg4d/python, a base image of Debian's own packages, where
+#                                                             no registry can be reached; then build with
+#                                                             -- --build-arg PYTHON=dg4d/python
 #
 # What follows `--` goes to the engine, for example --secret id=pip,src=pip.conf for a package index of your own.
 # $DG4D_ENGINE chooses the engine.
@@ -30,14 +33,19 @@ builder() {
 }
 
 build() {
-    local names=() program
+    local names=() target=() program
     while [ $# -gt 0 ] && [ "$1" != -- ]; do names+=("$1"); shift; done
     [ $# -gt 0 ] && shift
     program=$(engine)
     [ ${#names[@]} -gt 0 ] || names=(cpu flows)
     for name in "${names[@]}"; do
-        [ -f "deploy/images/$name.Dockerfile" ] || { echo "There is no image $name." >&2; exit 2; }
-        $(builder "$program") --file "deploy/images/$name.Dockerfile" --tag "dg4d/$name" "$@" .
+        case "$name" in
+            cpu | cuda | flows) target=(--file "deploy/images/$name.Dockerfile" --tag "dg4d/$name") ;;
+            flows-cuda)
+                target=(--file deploy/images/flows.Dockerfile --tag dg4d/flows:cuda --build-arg STEPS=dg4d/cuda) ;;
+            *) echo "There is no image $name; use cpu, cuda, flows or flows-cuda." >&2; exit 2 ;;
+        esac
+        $(builder "$program") "${target[@]}" "$@" .
     done
 }
 
@@ -55,5 +63,5 @@ base() {
 case "${1:-}" in
     build) shift; build "$@" ;;
     base) base ;;
-    *) sed -n '2,10s/^# \{0,1\}//p' "$0"; exit 2 ;;
+    *) sed -n '2,13s/^# \{0,1\}//p' "$0"; exit 2 ;;
 esac

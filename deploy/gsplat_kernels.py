@@ -38,7 +38,7 @@ def main() -> int:
     stamp = f"gsplat {version('gsplat')}, torch {version('torch')}, GPUs {' '.join(targets)}\n"
     if (package / STAMP).exists() and (package / STAMP).read_text(encoding="utf-8") == stamp:
         return 0
-    say(f"Compiling gsplat's kernels for GPUs of architecture {' '.join(targets)}: minutes, once.")
+    say(f"Compiling gsplat's kernels for GPUs of architecture {' '.join(targets)}: this takes minutes, once.")
     os.environ["TORCH_CUDA_ARCH_LIST"] = " ".join(targets)
     cuda = package / "cuda"
     load(

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import weakref
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from flows.inputs.json_text import loads
 from flows.inputs.package_record import RECORD, record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.publish import check_writable, load_verified
-from flows.packages.view import ASSET, viewer_html, viewer_of_package
+from flows.packages.view import ASSET, MANIFEST, viewer_html, viewer_of_package
 from steps.artifacts.archives import unpack
 from steps.store.files import remove_tree
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from steps.artifacts.rendering import Renderer, States
 
 REPORT = "report.json"
+APPLE_DOUBLE = "__MACOSX"  # folder that macOS adds to zips, for attributes of files
 FRAME_HEIGHT = 520  # pixels of the viewer in a notebook
 ROUNDING = 1e-6  # frames by which a time counts as that of a frame
 
@@ -49,14 +51,26 @@ def load(package: str | Path) -> "Asset":
         raise BadInput(f"{path} does not exist; give a folder that `dg4d make` wrote, or a zip of one")
     folder = Path(tempfile.mkdtemp(prefix="dg4d-asset-"))
     try:
-        unpack(path, folder, str(path))
-        record = load_verified(folder) if (folder / RECORD).exists() else {"item": path.stem}
-        asset = Asset(folder, record=record, package=path)
+        unpack(path, folder, str(path), lambda name: not name.startswith(f"{APPLE_DOUBLE}/"))
+        root = _package_root(folder)
+        record = load_verified(root) if (root / RECORD).exists() else {"item": path.stem}
+        asset = Asset(root, record=record, package=path)
+    except BadInput as error:
+        remove_tree(folder)
+        raise BadInput(str(error).replace(str(folder), str(path))) from error
     except BaseException:
         remove_tree(folder)
         raise
     weakref.finalize(asset, remove_tree, folder)
     return asset
+
+
+def _package_root(folder: Path) -> Path:
+    """Return the folder of the package in an unpacked zip: itself, or its only folder, as in a zip of the folder."""
+    if (folder / MANIFEST).exists():
+        return folder
+    folders = [path for path in folder.iterdir() if path.is_dir()]
+    return folders[0] if len(folders) == 1 else folder
 
 
 class Asset:
@@ -148,14 +162,20 @@ class Asset:
         """Render the asset as an RGBA picture in [0, 1] with straight alpha, shape (height, width, 4).
 
         Args:
-            camera: pose, field of view and size; it looks at the middle of the input picture, from a distance in units
-                of the fit, whatever the height of the asset. None: the camera of the input picture, 256 pixels.
+            camera: pose, field of view and size, at most 4096 x 4096 pixels; it looks at the middle of the input
+                picture, from a distance in units of the fit, whatever the height of the asset. None: the camera of the
+                input picture, 256 x 256 pixels.
             t: time in seconds.
             mesh: render the textured mesh instead of the Gaussians.
+
+        Raises:
+            BadInput: the time or the size is out of range, or the folder holds another asset.
+            BackendUnavailable: the rasterizer cannot run here.
         """
         from dg4d_lib.cameras.orbit import OrbitCamera
 
         camera = OrbitCamera() if camera is None else camera
+        _check_size(camera)
         drawn = (self._draw_mesh if mesh else self._draw_gaussians)(self._position(t), [camera])
         picture: NDArray[np.float32] = drawn[0].detach().float().cpu().numpy()
         return picture
@@ -243,3 +263,19 @@ class Asset:
         from steps.artifacts.rendering import mesh_renderer
 
         return mesh_renderer(self._surface)
+
+
+def _check_size(camera: "OrbitCamera") -> None:
+    """Refuse pictures that are too large, and sizes that are not whole numbers; the camera checks the rest.
+
+    Raises:
+        BadInput: says what was given and what is allowed.
+    """
+    from steps.artifacts.rendering import LARGEST
+
+    sides: tuple[Any, Any] = camera.width, camera.height  # the types are not checked at run time
+    if not all(isinstance(side, Integral) and 1 <= int(side) <= LARGEST for side in sides):
+        raise BadInput(
+            f"the picture is {sides[0]} x {sides[1]} pixels; give a camera whose width and height are whole numbers "
+            f"from 1 to {LARGEST}"
+        )

@@ -1,10 +1,13 @@
 """Conversion of pictures and videos: `make` and `batch`."""
 
+import math
+import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union
 
@@ -12,7 +15,7 @@ from pydantic import ValidationError
 
 from dg4d.asset import Asset, load
 from dg4d.progress import OnProgress, reporting
-from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.errors import BadInput, DG4DError, quoted
 from flows.convert import connect, convert_job, stored
 from flows.engine.output_lock import is_up_to_date
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest, name_from_text
@@ -21,12 +24,10 @@ from flows.inputs.manifest import Item, items_of
 from flows.inputs.naming import name_from_path, unique_names
 from flows.inputs.setting_reference import check_names
 from flows.packages.publish import check_folder
-from flows.step_errors import StepError
 from steps.contract import settings_errors
 from steps.profiles import profile as named_profile
 from steps.profiles import revise
 from steps.sources.views import check_direction
-from steps.store.artifact_store import ArtifactMissing, StoreUnreachable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,10 +37,16 @@ if TYPE_CHECKING:
 Engine = Literal["inline", "prefect"]
 ENGINES = ("inline", "prefect")
 Picture = Union[str, Path, "Image.Image", "NDArray[np.generic]"]
-Views = Mapping[float | tuple[float, float], str | Path]  # azimuth, or azimuth and elevation, in degrees
+Views = Mapping[float | tuple[float, float], Picture]  # azimuth, or azimuth and elevation, in degrees
+VIEWS_EXAMPLE = 'for example {90: "right.png"}'
+What = Literal["picture", "view", "mask"]
 CHANNELS = (3, 4)
-PNG_MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")  # of PIL images
-FAILURES = (DG4DError, StepError, ArtifactMissing, StoreUnreachable, OSError)  # of one item of a batch
+PNG_MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "I;16B")  # of PIL images
+CONVERTED_MODES = {  # PIL modes that PNG does not have, and the one that they become
+    "CMYK": "RGB", "YCbCr": "RGB", "LAB": "RGB", "HSV": "RGB", "RGBX": "RGB", "RGBa": "RGBA", "La": "LA", "PA": "RGBA",
+}  # fmt: skip
+ROUNDING = 0.5 / 255  # by which floats may leave [0, 1]: half a step of 8 bits
+FAILURES = (DG4DError, OSError)  # of one item of a batch
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ def make(
     cameras: str | Path | None = None,
     asset: str | Path | None = None,
     bank: str | Path | None = None,
-    mask: str | Path | None = None,
+    mask: Picture | None = None,
     depth: str | Path | None = None,
     layers: str | Path | None = None,
     profile: str = "preview",
@@ -84,15 +91,17 @@ def make(
         picture: picture or video: a path, a PIL image, or an array of shape (height, width, 3 or 4), uint8 or float in
             [0, 1].
         text: prompt for a text-to-image model, instead of a picture.
-        video: driving video or folder of frames; a `picture` only names the asset.
-        views: pictures of other sides at the first moment, by azimuth or (azimuth, elevation) in degrees.
+        video: driving video or folder of frames; its first frame is the subject, and a `picture` only names the asset.
+        views: pictures of other sides in the first frame, by azimuth or (azimuth, elevation) in degrees; each as
+            `picture`.
         turntable: video, or folder of frames, of the still subject turned once.
-        cameras: transforms.json of nerfstudio, with pictures of one moment or synchronized videos.
+        cameras: transforms.json of nerfstudio: pictures of the first frame, or synchronized videos.
         asset: model of your own, a mesh or splats, that is set in motion.
         bank: folder of ground-truth views, for `prior.kind=oracle`.
-        mask: picture, or folder of frames for a video, that is white where the subject is.
+        mask: picture, or folder of frames for a video, that is white where the subject is: a path, a PIL image, or an
+            array as `picture`, also bool and of shape (height, width).
         depth: picture of the depth of the first frame: integers are inverse depth, floating-point numbers distances.
-        layers: gray picture of the first frame: parts lighter than mid-gray lie before the rest, darker ones behind it.
+        layers: gray picture of the first frame: lighter than mid-gray is nearer, darker is farther.
         profile: set of settings.
         seed: seed of every step.
         name: name of the asset; default: from the name of picture, model or video, or from the text.
@@ -108,34 +117,32 @@ def make(
     Raises:
         BadInput: the input or a setting cannot be used; says what is allowed.
         BackendUnavailable: a library, a device or weights are missing.
-        StepError: a step failed; the output folder is as it was.
+        StepError: a step failed; the output folder is as it was. If the step finds that the input cannot be used, or
+            that something is missing, the error is also one of the two above.
     """
-    if views is not None and not isinstance(views, Mapping):
-        raise BadInput(
-            'views is a dict of azimuth to file, for example {90: "right.png"}; given ' + type(views).__name__
-        )
-    with _as_file(picture) as path:
+    driving_video, model = _path("video", video), _path("asset", asset)
+    with tempfile.TemporaryDirectory(prefix="dg4d-pictures-") as scratch:
         request = _request(
-            item=name or _name_of(picture, asset, video, text),
-            picture=path,
+            item=name or _name_of(picture, model, driving_video, text),
+            picture=None if picture is None else _file(picture, Path(scratch), "picture"),
             text=text,
-            video=Path(video) if video is not None else None,
-            bank=Path(bank) if bank is not None else None,
-            asset=Path(asset) if asset is not None else None,
-            mask=Path(mask) if mask is not None else None,
-            depth=Path(depth) if depth is not None else None,
-            layers=Path(layers) if layers is not None else None,
+            video=driving_video,
+            bank=_path("bank", bank),
+            asset=model,
+            mask=None if mask is None else _file(mask, Path(scratch), "mask", "mask"),
+            depth=_path("depth", depth),
+            layers=_path("layers", layers),
             given_views=ViewsRequest(
-                views=tuple(_view_file(place, path) for place, path in (views or {}).items()),
-                turntable=Path(turntable) if turntable is not None else None,
-                cameras=Path(cameras) if cameras is not None else None,
+                views=_view_files({} if views is None else views, Path(scratch)),
+                turntable=_path("turntable", turntable),
+                cameras=_path("cameras", cameras),
             ),
             profile=profile,
             settings=revise(named_profile(profile), flat_settings(settings)),
             seed=seed,
             commercial_only=commercial_only,
         )
-        folder = Path(out) if out is not None else Path("out") / request.item
+        folder = _path("out", out) or Path("out") / request.item
         return _convert(request, folder, engine, on_progress, force)
 
 
@@ -273,7 +280,7 @@ def _items(
         paths = []
         for number, one in enumerate(pictures, 1):
             folder = Path(scratch) / str(number)
-            paths.append(Path(one) if isinstance(one, str | Path) else _written(one, folder, f"picture-{number}"))
+            paths.append(_file(one, folder, f"picture-{number}"))
         if not paths:
             raise BadInput("the batch is empty; give one picture or more")
         names = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in paths])
@@ -283,52 +290,105 @@ def _items(
         ]
 
 
-@contextmanager
-def _as_file(picture: Picture | None) -> Iterator[Path | None]:
-    """Yield the path of a picture; one in memory is a temporary file meanwhile."""
-    if picture is None or isinstance(picture, str | Path):
-        yield None if picture is None else Path(picture)
-        return
-    with tempfile.TemporaryDirectory(prefix="dg4d-picture-") as folder:
-        yield _written(picture, Path(folder), "picture")
+def _path(name: str, given: Any) -> Path | None:
+    """Return the path that an argument has, if it is given.
+
+    Raises:
+        BadInput: it is not a path.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, str | os.PathLike):
+        raise BadInput(f"{name} is a path; given {type(given).__name__}")
+    return Path(given)
 
 
-def _written(picture: Any, folder: Path, stem: str) -> Path:
+def _file(given: Any, folder: Path, stem: str, what: What = "picture") -> Path:
+    """Return a path as it is; write a picture in memory into a folder."""
+    return Path(given) if isinstance(given, str | os.PathLike) else _written(given, folder, stem, what)
+
+
+def _written(given: Any, folder: Path, stem: str, what: What) -> Path:
     """Write a PIL image or an array as PNG.
 
     Raises:
-        BadInput: it is neither, or has another shape or type.
+        BadInput: it is neither, or has another shape, type or range.
     """
-    import numpy as np
     from PIL import Image, ImageOps
 
-    if not isinstance(picture, Image.Image):
-        pixels = np.asarray(picture)
-        is_picture = pixels.ndim == 3 and pixels.size and pixels.shape[2] in CHANNELS
-        if not is_picture or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
-            raise BadInput(
-                f"a picture in memory is a PIL image or an array of shape (height, width, 3 or 4), uint8 or float in "
-                f"[0, 1]; given {type(picture).__name__} of shape {pixels.shape} and type {pixels.dtype}"
-            )
-        if pixels.dtype.kind == "f":
-            pixels = (np.nan_to_num(pixels).clip(0, 1) * 255).round()
-        picture = Image.fromarray(pixels.astype(np.uint8))
+    picture = given if isinstance(given, Image.Image) else Image.fromarray(_pixels(given, what))
     picture = ImageOps.exif_transpose(picture)  # as in files
     if picture.mode not in PNG_MODES:
-        picture = picture.convert("RGBA" if picture.mode == "RGBa" else "RGB")
+        if picture.mode not in CONVERTED_MODES:
+            raise BadInput(
+                f"a PIL image of mode {picture.mode!r} has no known range: scale its values to 0 to 255 and convert it "
+                f"to L or RGB; allowed modes: {', '.join((*PNG_MODES, *CONVERTED_MODES))}"
+            )
+        picture = picture.convert(CONVERTED_MODES[picture.mode])
     folder.mkdir(parents=True, exist_ok=True)
     picture.save(folder / f"{stem}.png")
     return folder / f"{stem}.png"
 
 
-def _name_of(picture: Picture | None, asset: str | Path | None, video: str | Path | None, text: str) -> str:
-    if picture is not None and not isinstance(picture, str | Path):
+def _pixels(given: Any, what: What) -> "NDArray[np.uint8]":
+    """Return an array as 8-bit pixels.
+
+    Raises:
+        BadInput: it is not an array of pixels, or its floats leave [0, 1].
+    """
+    import numpy as np
+
+    pixels = np.asarray(given)
+    is_plane = what == "mask" and pixels.ndim == 2
+    is_picture = pixels.ndim == 3 and pixels.shape[2] in CHANNELS
+    is_known = pixels.dtype == np.uint8 or pixels.dtype.kind in ("fb" if what == "mask" else "f")
+    if not pixels.size or not (is_plane or is_picture) or not is_known:
+        shape, types = ("(height, width) or ", "bool, ") if what == "mask" else ("", "")
+        raise BadInput(
+            f"a {what} is a path, a PIL image or an array of shape {shape}(height, width, 3 or 4), {types}uint8 or "
+            f"float in [0, 1]; given {type(given).__name__} of shape {pixels.shape} and type {pixels.dtype}"
+        )
+    if pixels.dtype == np.uint8:
+        return pixels
+    lowest, highest = float(pixels.min()), float(pixels.max())  # NaN if one is NaN
+    if not -ROUNDING <= lowest <= highest <= 1 + ROUNDING:
+        found = (
+            "NaN; replace it"
+            if math.isnan(lowest)
+            else f"values from {lowest:g} to {highest:g}; divide by 255, or clip them"
+        )
+        raise BadInput(f"a {what} as an array has floats in [0, 1]; given {found}")
+    return (pixels.clip(0, 1) * 255.0).round().astype(np.uint8)
+
+
+def _name_of(picture: Picture | None, asset: Path | None, video: Path | None, text: Any) -> str:
+    if picture is not None and not isinstance(picture, str | os.PathLike):
         return "asset"
-    named = picture or asset or video
-    return name_from_path(Path(named)) if named else name_from_text(text)
+    if named := picture or asset or video:
+        return name_from_path(Path(named))
+    if not isinstance(text, str):
+        raise BadInput(f"text is a string; given {type(text).__name__}")
+    return name_from_text(text)
 
 
-def _view_file(place: float | tuple[float, float], path: str | Path) -> ViewFile:
-    azimuth, elevation = place if isinstance(place, tuple) else (place, 0.0)
-    check_direction(azimuth, elevation, str(path))
-    return ViewFile(azimuth=azimuth, elevation=elevation, path=Path(path))
+def _view_files(views: Views, folder: Path) -> tuple[ViewFile, ...]:
+    """Return the files of views and their directions; write views in memory into a folder.
+
+    Raises:
+        BadInput: it is not a dict of pictures by direction, or a direction is out of range.
+    """
+    if not isinstance(views, Mapping):
+        raise BadInput(f"views is a dict of azimuth to picture, {VIEWS_EXAMPLE}; given {type(views).__name__}")
+    found = []
+    for number, (place, given) in enumerate(views.items(), 1):
+        angles = place if isinstance(place, tuple) else (place, 0.0)
+        if len(angles) != 2 or not all(isinstance(angle, Real) for angle in angles):
+            raise BadInput(
+                f"views has the direction {quoted(place)}; give the azimuth, or (azimuth, elevation), in degrees as "
+                f"numbers, {VIEWS_EXAMPLE}"
+            )
+        path = _file(given, folder, f"view-{number}", "view")
+        azimuth, elevation = map(float, angles)
+        check_direction(azimuth, elevation, path.name)
+        found.append(ViewFile(azimuth=azimuth, elevation=elevation, path=path))
+    return tuple(found)

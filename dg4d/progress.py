@@ -21,9 +21,9 @@ class Progress:
         kind: `started`, `progress`, `note`, `remark`, `finished` or `failed`.
         number: position of the step from 1 on; 0 for a step that was not planned.
         of: number of planned steps.
-        fraction: done share of this step, 0 to 1.
+        fraction: completed fraction of this step, 0 to 1.
         seconds_left: estimate for the whole conversion; None while too little is known.
-        values: current figures of the step, such as its loss.
+        values: current metrics of the step, such as its loss.
         text: text of a note or a remark.
         cached: true if a finished step was taken from an earlier conversion.
     """

@@ -17,7 +17,7 @@ class GltfSettings(Settings):
         description="texture format; png: lossless, larger; webp: smallest (EXT_texture_webp), with a 512-pixel jpeg "
         "as a fallback",
     )
-    quality: int = Field(85, ge=1, le=100, description="of jpeg and webp; from 85, jpeg does not subsample chroma")
+    quality: int = Field(85, ge=1, le=100, description="JPEG or WebP quality; from 85, JPEG does not subsample chroma")
     quantized: bool = Field(
         True, description="16 bits for positions and 8 for normals instead of 32 (KHR_mesh_quantization)"
     )
@@ -31,14 +31,16 @@ class GltfSettings(Settings):
         le=128,
         description="number of principal components as morph targets instead of one target per frame; 0: one per frame",
     )
-    interpolation: Literal["linear", "step"] = Field("linear", description="between frames")
+    interpolation: Literal["linear", "step"] = Field("linear", description="interpolation between frames")
     moving_normals: bool = Field(True, description="animate normals; they take half of an uncompressed file")
     textures: Literal["pointer", "core"] = Field(
         "pointer",
         description="animated textures; pointer: one atlas and KHR_animation_pointer (other readers show the first "
         "frame); core: one node and texture per frame",
     )
-    atlas_size: int = Field(4096, ge=64, le=8192, description="largest side of such an atlas, pixels")
+    atlas_size: int = Field(
+        4096, ge=64, le=8192, description="largest side of a texture atlas (pack.gltf.textures=pointer), pixels"
+    )
     roughness: Share = Field(1.0, description="roughness factor of the material")
     metallic: Share = Field(0.0, description="metallic factor of the material")
 
@@ -76,8 +78,8 @@ class GateSettings(Settings):
     )
     added_folds_most: Share = Field(
         0.1,
-        description="such triangles that the motion of a user's own model adds; artists' own animations of seven "
-        "models add up to 0.073, for parts slide into each other",
+        description="with --asset: share of the triangles that the fitted motion makes cross, flip or fold, in the "
+        "worst frame; animations by artists reach 0.073 (seven models), because parts slide into each other",
     )
     agreement_least: Share = Field(0.85, description="overlap of the silhouettes of mesh and splats, IoU")
     sharpness_least: NotNegative = Field(0.75, le=10, description="color gradients, relative to the input image")
@@ -110,7 +112,7 @@ class PackSettings(Settings):
         0.0,
         ge=0,
         le=240,
-        description="frame rate of the files, from 1; the motion is resampled (paper's code: 4 times the video's); "
+        description="frame rate of the files, from 1; the motion is resampled (public code: 4 times the video's); "
         "0: that of the driving video, which a mesh per frame always uses",
     )
     height_m: float = Field(
@@ -122,13 +124,13 @@ class PackSettings(Settings):
     ground: bool = Field(
         True,
         description="put the lowest point of the animation on y = 0 and its center above the origin; false: the origin "
-        "is where the camera looks",
+        "is the point that the camera looks at",
     )
     gltf: GltfSettings = GltfSettings()
     delight: bool = Field(
         False,
-        description="divide the picture's light out of the mesh's texture, as spherical harmonics of degree 2, for "
-        "viewers with lights; splats keep it, and a bright belly is taken for light",
+        description="divide shading, estimated as spherical harmonics of degree 2, out of the mesh texture, for "
+        "viewers with lights; bright albedo such as a white belly may be removed too; splats are unchanged",
     )
     lods: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
         (),
@@ -143,11 +145,13 @@ class PackSettings(Settings):
         0.35, description="largest RMS error of the rig, relative to the motion; else it is left out"
     )
     usd: bool = Field(
-        True, description="write a skeleton animation as USDZ, and exact point samples and splats as another one"
+        True,
+        description="write asset.usdz (on a skeleton if one follows the motion) and asset_splats.usdz (splats, exact "
+        "mesh)",
     )
     splats: bool = Field(True, description="write one 3DGS PLY per frame")
     spz: bool = Field(True, description="write one SPZ per frame, a quarter of the size")
-    spz_version: Literal[3, 4] = Field(3, description="version of SPZ; 4 is 5 % smaller, and fewer programs read it")
+    spz_version: Literal[3, 4] = Field(3, description="version of SPZ; 4 is 5 % smaller, but fewer programs read it")
     splat_gltf: Literal["none", "ratified", "rc1"] = Field(
         "none", description="write one GLB of splats per frame, by this version of KHR_gaussian_splatting"
     )
@@ -182,12 +186,20 @@ class PackSettings(Settings):
 class AssetSettings(Settings):
     """A model of the user's own (`--asset`): its placement, and the fit of its motion; ours."""
 
-    find_azimuth: bool = Field(True, description="find the azimuth from the first frame; false: `azimuth_deg`")
+    find_azimuth: bool = Field(True, description="estimate the azimuth from the first frame; false: use azimuth_deg")
     azimuth_deg: float = Field(
-        0.0, ge=-360, le=360, description="azimuth of the model that the video shows, 0 on its +z; `--asset-azimuth`"
+        0.0,
+        ge=-360,
+        le=360,
+        description="azimuth of the model that the video shows; 0: its +z axis; set by `--asset-azimuth`",
     )
     max_faces: int = Field(200000, ge=100, le=2000000, description="largest number of triangles of a model")
-    max_splats: int = Field(100000, ge=100, le=1000000, description="splats of a model; more are merged to so many")
+    max_splats: int = Field(
+        100000,
+        ge=100,
+        le=1000000,
+        description="largest number of splats of a model; larger scans are merged to this number",
+    )
     min_agreement: Share = Field(
         0.5, description="smallest IoU of the outlines of model and first frame; below, the model is refused"
     )
@@ -195,8 +207,8 @@ class AssetSettings(Settings):
     fit_points: int = Field(6000, ge=100, le=200000, description="number of Gaussians that the fit renders")
     skeleton: bool = Field(
         True,
-        description="where the first frame shows a skinned model in another pose than at rest, its joints are turned "
-        "to that pose and move it; false: its surface bends",
+        description="pose a skinned model by its joints if the first frame shows it in another pose than at rest, and "
+        "animate the joints; false: deform the surface instead",
     )
     nodes: int = Field(
         200,
@@ -208,50 +220,51 @@ class AssetSettings(Settings):
     size: int = Field(128, ge=32, le=512, multiple_of=16, description="pixels of the compared pictures")
     tracking: Literal["flow", "descent"] = Field(
         "flow",
-        description="frame by frame: `flow`: optical flow from renders, and far jumps are searched; "
-        "`descent`: along gradients, softer",
+        description="flow: optical flow from renders, plus a search for large motions; descent: gradient descent, "
+        "smoother",
     )
     track_iterations: int = Field(
-        3, ge=1, le=1000, description="rounds of optical flow, or steps of the descent, per frame while tracking"
+        3, ge=1, le=1000, description="rounds of optical flow, or steps of gradient descent, per frame while tracking"
     )
     joint_iterations: int = Field(200, ge=0, le=10000, description="iterations over all frames after tracking")
-    joint_frames: int = Field(8, ge=1, le=512, description="frames of a joint iteration")
+    joint_frames: int = Field(8, ge=1, le=512, description="frames per joint iteration")
     lr: Positive = Field(
         0.003, description="learning rate of the position of the model, world units; for `tracking=descent`, 0.006"
     )
     smoothing: float = Field(1.0, ge=0, le=1000, description="smoothing of the steps over the control graph")
-    color_weight: NotNegative = Field(1.0, description="colors of the video, mean squared error over the subject")
-    alpha_weight: NotNegative = Field(1.0, description="alpha of the video, mean squared error over the subject")
-    flow: NotNegative = Field(0.1, description="optical flow between frames while tracking")
+    color_weight: NotNegative = Field(1.0, description="weight of the color loss: mean squared error over the subject")
+    alpha_weight: NotNegative = Field(1.0, description="weight of the alpha loss: mean squared error over the subject")
+    flow: NotNegative = Field(0.1, description="weight of the optical flow loss while tracking")
     integrate_rotations: bool = Field(
         False,
-        description="positions of nodes follow from their rotations (a Poisson equation), for wings and limbs that "
-        "swing far; with `tracking=flow`, in the joint iterations only",
+        description="compute node positions from their rotations (a Poisson equation), for wings and limbs that swing "
+        "far; with tracking=flow, in the joint iterations only",
     )
-    rigidity: NotNegative = Field(1.0, description="as-rigid-as-possible energy of the surface")
-    bending: NotNegative = Field(0.1, description="differences of neighboring rotations, times `rigidity`")
+    rigidity: NotNegative = Field(1.0, description="weight of the as-rigid-as-possible energy")
+    bending: NotNegative = Field(
+        0.1, description="weight of differences between neighboring rotations, relative to rigidity"
+    )
     rigidity_loss: Literal["l1", "log", "best"] = Field(
         "best",
-        description="loss of stretch and bend, quadratic near 0: `l1`: linear beyond; `log`: logarithmic, for few "
-        "joints that bend a lot; `best`: both, in twice the time, and the motion that shows the video better is kept",
+        description="loss of stretching and bending, quadratic near 0; l1: linear beyond; log: logarithmic, for few "
+        "joints that bend far; best: both, in twice the time, and the motion that is closer to the video is kept",
     )
     rigid_parts: int = Field(
         4,
         ge=0,
         le=16,
-        description="most rigid parts, as a box and its lid, that the motion is fitted with in a second try, where "
-        "so few explain it; the motion that shows the video better is kept; 0: no second try",
+        description="largest number of rigid parts (such as a chest and its lid) in a second, piecewise rigid fit; "
+        "tried only if so few explain the motion, and kept if it is closer to the video; 0: no second fit",
     )
-    inertia: NotNegative = Field(0.002, description="distance to the extrapolated motion while tracking")
-    smoothness: NotNegative = Field(0.1, description="accelerations in the joint fit")
-    depth: NotNegative = Field(0.001, description="displacements along the viewing direction")
+    inertia: NotNegative = Field(0.002, description="weight of the distance to the extrapolated motion while tracking")
+    smoothness: NotNegative = Field(0.1, description="weight of accelerations in the joint fit")
+    depth: NotNegative = Field(0.001, description="weight of displacements along the viewing direction")
     whole_depth: NotNegative = Field(
         0.001,
-        description="displacement of the whole along the viewing direction, which rigidity and perspective tell; "
-        "for `tracking=descent`, 0.15",
+        description="weight of moving the whole model along the viewing direction; with tracking=descent use 0.15",
     )
     across: NotNegative = Field(
         0.15,
-        description="displacements across the upright mirror plane of the model: legs and lids swing in it, "
-        "which tells how far they move in depth; without such a plane, this is not used",
+        description="weight of displacements perpendicular to the model's vertical mirror plane, in which legs and "
+        "lids swing; unused without such a plane",
     )

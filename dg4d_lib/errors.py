@@ -9,7 +9,7 @@ DG4DError
 from collections.abc import Sequence
 
 MAX_QUOTED = 80  # characters of a value in a message
-OUT_OF_MEMORY = (  # in messages of errors that are no torch.OutOfMemoryError
+OUT_OF_MEMORY = (  # in messages of errors that are not torch.OutOfMemoryError
     "can't allocate memory",  # the allocator of the CPU
     "CUDA error: out of memory",  # the CUDA runtime, outside of torch's allocator
     "CUBLAS_STATUS_ALLOC_FAILED",  # cuBLAS allocates its own workspace

@@ -1,14 +1,14 @@
-"""Settings of the inputs: words, picture or video, the driving video, and drawn views of other sides."""
+"""Settings of the inputs: prompt, picture or video, driving video, and generated views of other sides."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from dg4d_lib.settings import PipelineBudget, Precision, Settings, Share, VideoModelSettings
+from dg4d_lib.settings import PRECISION, PipelineBudget, Precision, Settings, Share, VideoModelSettings
 
 
 class TextSettings(Settings):
-    """Input image by any text-to-image pipeline of diffusers; only for orders with a prompt."""
+    """Input image by any text-to-image pipeline of diffusers; only for requests with a prompt."""
 
     weights: str = Field("", description="Hugging Face hub id, or a folder in diffusers' layout; empty: none")
     size: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels of the square image")
@@ -19,7 +19,7 @@ class TextSettings(Settings):
         max_length=1000,
         description="appended to the prompt, so that the subject can be cut out",
     )
-    precision: Precision = Field("fp16", description="of the networks; always fp32 on CPUs")
+    precision: Precision = Field("fp16", description=PRECISION)
     low_memory: bool = Field(False, description="keep only the network in use on the GPU; slower")
 
 
@@ -40,7 +40,7 @@ class SubjectSettings(Settings):
     box: tuple[Annotated[int, Field(ge=0, le=1_000_000)], ...] = Field(
         (),
         max_length=4,
-        description="[X, Y, width, height] of the subject in pixels of the upright picture; what is outside is "
+        description="[X, Y, width, height] of the subject in pixels of the upright picture; pixels outside become "
         "transparent; []: the whole picture",
     )
     size: int = Field(512, ge=32, le=2048, description="pixels of the square frame")
@@ -50,17 +50,21 @@ class SubjectSettings(Settings):
         "auto: keep a square cut-out that contains the whole subject, else center",
     )
     border: float = Field(
-        0.2, ge=0, lt=0.9, description="margin around a centered subject, fraction of the frame (paper's code)"
+        0.2, ge=0, lt=0.9, description="margin around a centered subject, fraction of the frame (public code)"
     )
     turn_deg: float = Field(
         0.0,
         ge=-60,
         le=60,
-        description="degrees that the subject is turned about the vertical; positive: the right side of the picture is "
-        "nearer; 0: not known, see ground_turn",
+        description="yaw of the subject in degrees; positive: its right side in the picture is nearer; 0: unknown, see "
+        "ground_turn",
     )
     ground_turn: float = Field(
-        0.6, ge=0, le=1, description="factor on the turn that the ground line of footage gives if `turn_deg` is 0"
+        0.6,
+        ge=0,
+        le=1,
+        description="factor on the yaw that is estimated from where the subject touches the ground in a video; used if "
+        "turn_deg is 0",
     )
     depth_kind: Literal["auto", "inverse", "distance"] = Field(
         "auto",
@@ -96,13 +100,14 @@ class WarpSettings(Settings):
     kind: Literal["warp"] = "warp"
     candidates: Candidates = 1
     pick: Pick = 0
-    motion: Motion = Field("sway", description="weights-free motion, ours; further candidates use the other motions")
+    motion: Motion = Field("sway", description="kind of the warp, ours; further candidates use the other kinds")
     strength: float = Field(1.0, gt=0, le=3, description="factor on the motion's amplitude")
     frames: int = Field(
         14,
         ge=3,
         le=128,
-        description="frames of a generated video (paper: 14); of two, the second shows most motions at rest again",
+        description="frames of a generated video (paper: 14); at least 3, because both frames of a two-frame loop "
+        "would show the rest pose",
     )
     fps: float = Field(7.0, ge=0.01, le=120, description="frames per second of a generated video (paper: 7)")
 
@@ -135,10 +140,12 @@ class DiffusersVideoSettings(Settings):
         "the subject moves naturally in place, the whole of it stays in the picture, static camera, plain white "
         "background",
         max_length=2000,
-        description="for pipelines that take a prompt",
+        description="prompt, for pipelines that take one",
     )
     negative_prompt: str = Field(
-        "camera movement, zoom, cut, shadow, text, blurry, deformed", max_length=2000, description="likewise"
+        "camera movement, zoom, cut, shadow, text, blurry, deformed",
+        max_length=2000,
+        description="negative prompt, for pipelines that take one",
     )
     loop: bool = Field(
         False,
@@ -159,7 +166,7 @@ class DiffusersVideoSettings(Settings):
     width: int = Field(512, ge=32, le=2048, multiple_of=8, description="pixels, rounded to a size that the model takes")
     num_inference_steps: int = Field(30, ge=1, le=200, description="denoising steps")
     guidance_scale: float = Field(5.0, ge=0, le=30, description="classifier-free guidance (Wan: 5)")
-    precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
+    precision: Precision = Field("bf16", description=PRECISION)
     memory_gb: PipelineBudget = 24.0
 
 
@@ -167,13 +174,13 @@ DrivingSettings = Annotated[WarpSettings | SvdSettings | DiffusersVideoSettings,
 
 
 class NoViewsSettings(Settings):
-    """Other sides are not drawn."""
+    """Other sides are not generated."""
 
     kind: Literal["none"] = "none"
 
 
 class ImageEditViewsSettings(Settings):
-    """Other sides drawn by an image-editing pipeline with a LoRA for camera angles (Qwen-Image-Edit)."""
+    """Other sides generated by an image-editing pipeline with a LoRA for camera angles (Qwen-Image-Edit)."""
 
     kind: Literal["image_edit"] = "image_edit"
     weights: str = Field(
@@ -189,19 +196,21 @@ class ImageEditViewsSettings(Settings):
     azimuths_deg: tuple[Literal[0, 45, 90, 135, 180, 225, 270, 315], ...] = Field(
         (0, 45, 90, 135, 180, 225, 270, 315),
         min_length=1,
-        description="azimuths of the drawn views; that of the input is not drawn at elevation 0",
+        description="azimuths of the generated views; azimuth 0 at elevation 0 is the input and is skipped",
     )
     elevations_deg: tuple[Literal[-30, 0, 30, 60], ...] = Field(
-        (0, 30), min_length=1, description="elevations of the drawn views"
+        (0, 30), min_length=1, description="elevations of the generated views"
     )
-    suffix: str = Field(", plain white background", max_length=1000, description="appended to the camera's words")
-    size: int = Field(1024, ge=64, le=2048, multiple_of=32, description="pixels of a drawn picture (the model's: 1024)")
+    suffix: str = Field(", plain white background", max_length=1000, description="appended to the camera prompt")
+    size: int = Field(
+        1024, ge=64, le=2048, multiple_of=32, description="pixels of a generated picture (the model's: 1024)"
+    )
     num_inference_steps: int = Field(40, ge=2, le=200, description="denoising steps (the model's: 40)")
     guidance_scale: float = Field(4.0, ge=0, le=30, description="classifier-free guidance (the model's: 4)")
-    precision: Precision = Field("bf16", description="of the networks; always fp32 on CPUs")
+    precision: Precision = Field("bf16", description=PRECISION)
     memory_gb: PipelineBudget = 24.0
     min_weight: Share = Field(
-        0.2, description="views whose agreement with the others, from 0 to 1, is lower are left out; ours"
+        0.2, description="views whose weight (agreement with the others, 0 to 1) is lower are dropped; ours"
     )
 
 

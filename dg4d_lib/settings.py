@@ -11,6 +11,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["fp16", "bf16", "fp32"]
+PRECISION = "floating-point precision of the networks; always fp32 on CPUs"  # description of such settings
 UnwrapMethod = Literal["charts", "xatlas"]
 NoiseDraw = Literal["annealed", "uniform"]  # timestep of an iteration: T_max, or uniform below it
 PipelineBudget = Annotated[
@@ -50,7 +51,7 @@ class VideoModelSettings(Settings):
     weights: str = Field(
         "svd", min_length=1, description="a name from `dg4d weights list`, or a folder in diffusers' layout"
     )
-    precision: Precision = Field("fp16", description="of the networks; always fp32 on CPUs")
+    precision: Precision = Field("fp16", description=PRECISION)
     low_memory: bool = Field(False, description="keep only the network in use on the GPU; slower")
     num_inference_steps: int = Field(25, ge=2, le=200, description="noise levels of the full schedule")
     min_guidance_scale: float = Field(1.0, ge=0, le=20, description="classifier-free guidance in the first frame")
@@ -83,8 +84,8 @@ class GeometricPriorSettings(Settings):
         0.03,
         ge=0,
         le=0.5,
-        description="standard deviation of the guessed depth, world units: a view from the side is the average over it,"
-        " soft along the direction in which depth shows",
+        description="standard deviation of the guessed depth, world units; side views are averaged over it, so they "
+        "are blurred along depth",
     )
     depth_weights: str = Field(
         "",
@@ -95,7 +96,7 @@ class GeometricPriorSettings(Settings):
 
 
 class LearnedPriorSettings(Settings):
-    """Shape prior of this package, trained on made-up shapes; no download."""
+    """Shape network of this package, trained on synthetic shapes; no download."""
 
     kind: Literal["learned"] = "learned"
     weight: float = Field(
@@ -105,15 +106,16 @@ class LearnedPriorSettings(Settings):
         0.0,
         ge=0,
         le=0.5,
-        description="0: views show a sharp surface; else views from the side are averaged over this standard deviation "
-        "of its depth, world units: closer to the truth on average, but soft (typical: 0.03)",
+        description="0: render a sharp surface; otherwise average side views over this standard deviation of its "
+        "depth, world units: closer to the ground truth on average, but blurred (typical: 0.03)",
     )
     contrast: float = Field(
         0.0,
         ge=0,
         le=16,
-        description="0: views of the surface of the most probable cells; else views averaged over all shapes that are "
-        "possible, with this factor on the log-odds of matter: closer to the truth on average, but fog (typical: 2)",
+        description="0: render the surface of the most probable cells; otherwise render the average over all possible "
+        "shapes, with this factor on the occupancy log-odds: closer to the ground truth on average, but foggy "
+        "(typical: 2)",
     )
 
 
@@ -131,8 +133,8 @@ class Zero123PriorSettings(Settings):
         description="last entry of the pose conditioning; xl: difference of the radii; stable (Stable-Zero123):"
         " polar angle of the input camera",
     )
-    guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (paper's code: 5)")
-    precision: Precision = Field("fp16", description="of the networks; always fp32 on CPUs")
+    guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (public code: 5)")
+    precision: Precision = Field("fp16", description=PRECISION)
     memory_gb: float = Field(
         24.0,
         ge=6,
@@ -154,7 +156,9 @@ class ImageDreamPriorSettings(Settings):
         description="a name from `dg4d weights list`, a Hugging Face hub id, or a folder in diffusers' layout",
     )
     guidance_scale: float = Field(5.0, ge=0, le=100, description="classifier-free guidance (public code: 5)")
-    precision: Precision = Field("fp16", description="of the networks, on a GPU (public code: fp16)")
+    precision: Precision = Field(
+        "fp16", description="floating-point precision of the networks on a GPU (public code: fp16)"
+    )
     memory_gb: float = Field(
         24.0,
         ge=8,
@@ -208,7 +212,7 @@ class SurfaceStartSettings(Settings):
         ge=0,
         le=500000,
         description="initial number of Gaussians; 0: 8,000 on a surface that the shape network predicts, which is "
-        "larger, else 5,000",
+        "larger; otherwise 5,000",
     )
 
 
@@ -220,7 +224,9 @@ class LgmStartSettings(Settings):
     views_weights: str = Field(
         "imagedream", min_length=1, description="ImageDream: a name from `dg4d weights list`, a hub id, or a folder"
     )
-    precision: Precision = Field("fp16", description="of the networks, on a GPU (public code: fp16)")
+    precision: Precision = Field(
+        "fp16", description="floating-point precision of the networks on a GPU (public code: fp16)"
+    )
     num_inference_steps: int = Field(30, ge=1, le=500, description="steps of ImageDream's sampler (public code: 30)")
     guidance_scale: float = Field(
         5.0, ge=0, le=100, description="classifier-free guidance of ImageDream (public code: 5)"
@@ -244,7 +250,8 @@ class FitSettings(Settings):
     reference_size: int = Field(256, ge=32, le=1024, description="pixels of the reference view")
     reference_schedule: tuple[ResolutionStage, ...] = Field(
         (),
-        description="pixels of the reference view by progress, at most reference_size, which follows (ours)",
+        description="pixels of the reference view by progress, each at most reference_size; after the last stage "
+        "reference_size is used (ours)",
     )
     viewpoints: int = Field(
         0,
@@ -256,9 +263,16 @@ class FitSettings(Settings):
     elevation_deg: float = Field(
         30.0, ge=0, le=80, description="random views have elevations within plus and minus this"
     )
-    color_weight: NotNegative = Field(10000.0, description="reference view, mean squared error, times progress")
-    alpha_weight: NotNegative = Field(1000.0, description="reference view, mean squared error, times progress")
-    ssim_weight: NotNegative = Field(0.0, description="reference view, 1 - SSIM, times progress; not in the paper")
+    color_weight: NotNegative = Field(
+        10000.0, description="weight of the color MSE of the reference view, multiplied by the progress (0 to 1)"
+    )
+    alpha_weight: NotNegative = Field(
+        1000.0, description="weight of the alpha MSE of the reference view, multiplied by the progress (0 to 1)"
+    )
+    ssim_weight: NotNegative = Field(
+        0.0,
+        description="weight of 1 - SSIM of the reference view, multiplied by the progress (0 to 1); not in the paper",
+    )
     guidance_weight: NotNegative = Field(1.0, description="weight of the prior's loss")
     t_max_start: float = Field(gt=0.02, le=1, description="T_max at the start of the annealing")
     t_max_end: Share = Field(
@@ -268,7 +282,7 @@ class FitSettings(Settings):
         0.98, gt=0.02, le=0.98, description="T_max is clipped to this (first release, dynamic stage: 0.5)"
     )
     noise_draw: NoiseDraw = Field(
-        "annealed", description="timestep of an iteration; annealed: T_max; uniform: drawn below T_max"
+        "annealed", description="timestep of an iteration; annealed: T_max; uniform: random below T_max"
     )
     means_lr: Positive
     means_lr_end: Positive
@@ -291,7 +305,8 @@ class StaticSettings(FitSettings):
     iterations: int = Field(500, ge=0, le=20000, description="0: keep the initial cloud (public code, after LGM)")
     views: int = Field(16, ge=0, le=64, description="random views per iteration (paper: 16)")
     background: Literal["white", "random"] = Field(
-        "white", description="of random views; random: black in half of the iterations (DreamGaussian)"
+        "white",
+        description="background of random views; random: black in half of the iterations, else white (DreamGaussian)",
     )
     start: StartSettings = BlobStartSettings()
     t_max_start: float = Field(0.98, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.98)")
@@ -333,16 +348,22 @@ class HexPlaneSettings(Settings):
     scales: tuple[Annotated[int, Field(ge=1, le=16)], ...] = Field(
         (1,), min_length=1, description="multi-resolution: factors on `spatial`; features are concatenated"
     )
-    variation_weight: NotNegative = Field(0.0, description="second differences over space, per plane (typical: 1e-4)")
-    smoothness_weight: NotNegative = Field(0.0, description="second differences over time, per plane (typical: 0.01)")
-    sparsity_weight: NotNegative = Field(0.0, description="L1 distance of time planes from one, each (typical: 1e-4)")
+    variation_weight: NotNegative = Field(
+        0.0, description="weight of second differences over space, per plane (typical: 1e-4)"
+    )
+    smoothness_weight: NotNegative = Field(
+        0.0, description="weight of second differences over time, per plane (typical: 0.01)"
+    )
+    sparsity_weight: NotNegative = Field(
+        0.0, description="weight of the L1 distance of each time plane from one (typical: 1e-4)"
+    )
 
 
 class MlpSettings(Settings):
     """Ablation: MLP on the positional encoding of position and time."""
 
     kind: Literal["mlp"] = "mlp"
-    frequencies: int = Field(6, ge=1, le=16, description="of the positional encoding")
+    frequencies: int = Field(6, ge=1, le=16, description="number of frequencies of the positional encoding")
     hidden: int = Field(64, ge=1, le=512, description="hidden units of the MLP")
     endpoint: Endpoint = True
 
@@ -368,18 +389,25 @@ class MotionSettings(FitSettings):
     views: int = Field(4, ge=0, le=64, description="random views per frame and iteration (paper: 4, fast: 1)")
     frames_per_iteration: int = Field(0, ge=0, le=512, description="random frames per iteration; 0: all")
     guided_frames: int = Field(
-        0, ge=0, le=512, description="those of an iteration's frames that get random views, drawn anew; 0: all (paper)"
+        0,
+        ge=0,
+        le=512,
+        description="number of an iteration's frames that also get random views, redrawn every iteration; 0: all "
+        "(paper)",
     )
     t_max_start: float = Field(0.5, gt=0.02, le=1, description="T_max at the start of the annealing (paper: 0.5)")
     network_lr: Positive = Field(6.4e-4, description="learning rate of MLPs")
     plane_lr: Positive = Field(6.4e-3, description="learning rate of planes and frame-wise displacements")
-    rigidity_weight: NotNegative = Field(0.0, description="local rigidity over time (Luiten et al. 2024)")
+    rigidity_weight: NotNegative = Field(0.0, description="weight of local rigidity over time (Luiten et al. 2024)")
     track_surface: bool = Field(
         True,
-        description="with pictures of other sides at the first frame, and a prior without weights: move their surface "
-        "as the video shows it; later frames are guided by the mean of its renders and of the other guess (ours)",
+        description="with pictures of other sides at the first frame, and prior.kind=geometric or learned: track their "
+        "surface through the video; later frames are guided by the mean of its renders and of the prediction for the "
+        "frame (ours)",
     )
-    trackings: Literal[1, 3] = Field(3, description="ways to track that surface; 1: faster by a minute or two (ours)")
+    trackings: Literal[1, 3] = Field(
+        3, description="number of different trackings of that surface; 1: faster by a minute or two (ours)"
+    )
     fine_tune: bool = Field(False, description="optimize the canonical Gaussians too (paper: no; public code: yes)")
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")
     means_lr_end: Positive = Field(
@@ -403,7 +431,7 @@ class MeshSettings(Settings):
     min_followed: Share = Field(
         0.87,
         description="smallest silhouette IoU of the best trial mesh that moves with the Gaussians; below, the mesh "
-        "follows the driving video, or in mode auto without one, every frame gets its own",
+        "follows the driving video, or without one, mode auto uses a mesh per frame",
     )
     max_stretch: NotNegative = Field(
         0.25,
@@ -412,29 +440,37 @@ class MeshSettings(Settings):
     )
     min_guided: Share = Field(
         0.85,
-        description="auto: smallest silhouette IoU of the best trial mesh that follows the driving video, else a mesh "
-        "per frame",
+        description="mode auto: smallest silhouette IoU of the best trial mesh that follows the driving video; below, "
+        "a mesh per frame is used",
     )
     source: Literal["gaussians", "prior"] = Field(
         "gaussians",
-        description="of one mesh: density of the Gaussians, or the guess of the learned prior without known views",
+        description="source of a tracked mesh: density of the Gaussians, or the shape that the learned prior predicts, "
+        "if no other views are known",
     )
     grid: int = Field(128, ge=16, le=512, description="resolution of the density field on each axis of [-1, 1]")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Gaussians below this opacity are ignored")
     density_threshold: Positive = Field(0.5, description="first isosurface level that is tried; unused by source=prior")
     edge_length: float = Field(
-        0.015, gt=0, le=0.3, description="of isotropic remeshing, in units of the normalized box, whose sides are 2"
+        0.015, gt=0, le=0.3, description="edge length of isotropic remeshing; the sides of the normalized box are 2"
     )
     fairing: float = Field(
         0.0, ge=0, le=1, description="world units; bumps of this wavelength lose half of their height"
     )
-    max_faces: int = Field(100000, ge=100, description="largest number of triangles, without those of strands")
+    max_faces: int = Field(
+        100000,
+        ge=100,
+        description="largest number of triangles; thin parts that are added later (antennae, whiskers) do not count",
+    )
     min_component: Share = Field(0.02, description="components with a smaller fraction of the faces are removed")
     unwrap: UnwrapMethod = Field(
-        "charts", description="charts: even, none mirrored (ours); xatlas: in half the time, with more islands"
+        "charts",
+        description="charts: even texel density, no mirrored charts (ours); xatlas: half the time, more charts",
     )
     texture_size: int = Field(1024, ge=64, le=8192, description="texels per side")
     render_size: int = Field(512, ge=64, le=2048, description="pixels of the renders that are baked into the texture")
     mirror_texture: bool = Field(
-        True, description="of a guessed mesh: its far side takes the mirror image of the near one, not a blurred guess"
+        True,
+        description="if source=prior: texture the far side with the mirror image of the near side, instead of a "
+        "blurred guess",
     )

@@ -51,7 +51,9 @@ def settings_page() -> str:
         "Change a setting with `--set NAME=VALUE`; values are JSON or plain text. The column `default` holds the"
         "\npaper's numbers where the paper has them; a profile sets which models are used."
         "\n`dg4d settings --profile paper` prints the paper's configuration. `dg4d make` starts from the profile"
-        "\n`preview`, whose values are listed where they differ. `dg4d settings NAME` prints the same.\n"
+        "\n`preview`, whose values are listed where they differ. `dg4d settings NAME` prints the same."
+        '\n"Ours" marks a choice that is in neither the paper nor its public code; "public code" is the authors\''
+        "\nrepository.\n"
     )
     parts = [NOTE, "# Settings\n", intro]
     for section in SECTIONS:

@@ -88,13 +88,17 @@ def make(
     text: Annotated[
         str,
         typer.Option(
-            metavar="WORDS",
+            metavar="PROMPT",
             help="a prompt instead of a picture; text-to-image model: --set text.weights=FOLDER_OR_HUB_ID",
         ),
     ] = "",
     video: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="driving video or folder of frames; a PICTURE only names the asset"),
+        typer.Option(
+            metavar="PATH",
+            help="driving video or folder of frames; its first frame is the subject, and PICTURE (optional) only names "
+            "the asset",
+        ),
     ] = None,
     view: Views = None,
     turntable: Turntable = None,
@@ -114,8 +118,8 @@ def make(
             "-o",
             "--out",
             metavar="DIR",
-            help="output folder; of several pictures: DIR/NAME; equal names get the suffix and a number: "
-            "DIR/newt-png-2  [default: out/NAME]",
+            help="output folder; with several pictures DIR/NAME; duplicate names are made unique with suffix and "
+            "number (DIR/newt-png-2)  [default: out/NAME]",
         ),
     ] = None,
     bank: Annotated[
@@ -140,7 +144,7 @@ def make(
     ] = None,
     commercial_only: Commercial = False,
     force: Annotated[
-        bool, typer.Option("--force", help="replace an asset of another name in the output folder")
+        bool, typer.Option("--force", help="replace an asset with a different name in the output folder")
     ] = False,
     pick: Annotated[int | None, typer.Option(min=1, max=16, metavar="K", help="use motion K of `dg4d motions`")] = None,
 ) -> None:
@@ -149,12 +153,12 @@ def make(
     Motions without a driving video, for --set driving.motion=NAME: sway, bend, breathe, bounce, wave, turn.
     """
     if not (pictures or text or video or asset):
-        raise typer.BadParameter("give a picture, a video, --text WORDS, or --asset FILE")
+        raise typer.BadParameter("give a picture, a video, --text PROMPT, or --asset FILE")
     if asset_azimuth is not None and asset is None:
         raise typer.BadParameter("--asset-azimuth needs --asset")
     with exit_on_error():
         from flows.commands import terminal
-        from flows.commands.make import Wish, make_each
+        from flows.commands.make import MakeArguments, make_each
         from flows.inputs.given_views import ViewsRequest, parse_views
 
         short = shortcut_settings(
@@ -188,8 +192,8 @@ def make(
             "--view": bool(sides),
         }
         alone = next((option for option, value in for_one.items() if value), "")
-        wish = Wish(tuple(pictures or ()), text, video, asset, alone, out, force, bool(pick), request)
-        if status := make_each(wish, terminal.console()):
+        arguments = MakeArguments(tuple(pictures or ()), text, video, asset, alone, out, force, bool(pick), request)
+        if status := make_each(arguments, terminal.console()):
             raise typer.Exit(status)
 
 
@@ -360,7 +364,13 @@ def render(
     elevation: Annotated[float, typer.Option(min=-90, max=90, metavar="DEG", callback=finite, help="degrees")] = 0.0,
     size: Annotated[int, typer.Option(min=16, max=4096, metavar="N", help="pixels")] = 256,
     frames: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="number of timestamps  [default: every frame]")
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="number of pictures, evenly spaced from the first to the last frame of the fit  "
+            "[default: every frame]",
+        ),
     ] = None,
     mesh: Annotated[bool, typer.Option("--mesh", help="render the textured mesh instead of the splats")] = False,
     fit: Annotated[

@@ -191,7 +191,7 @@ def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
         store.get(outputs["candidates"], folder / "motions.png")
         store.get(outputs["ranking"], folder / "motions.json")
-        unpack(store.path(outputs["films"]), folder, "the zip of films")
+        unpack(store.path(outputs["films"]), folder, "the zip of videos")
     ranking: dict[str, Any] = json.loads((folder / "motions.json").read_text(encoding="utf-8"))
     return ranking
 

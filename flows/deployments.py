@@ -74,7 +74,7 @@ def _sort_fields(schema: dict[str, Any]) -> None:
 
 def _options_field(options: "Options") -> dict[str, Any]:
     """Return the schema extra of a parameter with options, filled in with their defaults."""
-    return _title("How it is made") | {"default": options.model_dump(mode="json", exclude_none=True)}
+    return _title("Options") | {"default": options.model_dump(mode="json", exclude_none=True)}
 
 
 Text = Annotated[str, Field(min_length=1)]
@@ -87,7 +87,8 @@ Setting = Annotated[str, Field(pattern=r"^\s*[a-z_]+(\.[a-z_0-9]+)*\s*=", title=
 class Options(Frozen):
     """Options of every conversion."""
 
-    model_config = ConfigDict(json_schema_extra=_sort_fields)
+    # pydantic leaves the title of a field out of the schema if it is that of its class, by default the class name
+    model_config = ConfigDict(json_schema_extra=_sort_fields, title="Options of a conversion")
 
     profile: ProfileName = Field(
         "preview",
@@ -95,23 +96,23 @@ class Options(Frozen):
         description="`preview` takes minutes on any machine, without a pretrained model; others need a GPU and weights",
     )
     triangles: int | None = _optional(
-        "Triangles", "maximum number of the mesh, 100 or more; empty: as the profile says", ge=100
+        "Triangles", "largest number of triangles, 100 or more; empty: set by the profile", ge=100
     )
     texture: int | None = _optional(
-        "Texture size", "texels per side, from 64 to 8192; empty: as the profile says", ge=64, le=8192
+        "Texture size", "texels per side, from 64 to 8192; empty: set by the profile", ge=64, le=8192
     )
     fps: float | None = _optional(
-        "Frames per second", "of the files, from 1 to 240; empty: as the video, or the profile", ge=1, le=240
+        "Frames per second", "from 1 to 240; empty: that of the video, or set by the profile", ge=1, le=240
     )
     seed: int = Field(
         0,
         ge=0,
         le=LARGEST_SEED,
         title="Seed",
-        description=f"from 0 to {LARGEST_SEED}; another whole number gives another result of its kind",
+        description=f"from 0 to {LARGEST_SEED}; another seed gives another result",
     )
     commercial_only: bool = Field(
-        False, title="Commercial use only", description="refuse pretrained weights whose license forbids selling"
+        False, title="Commercial use only", description="refuse pretrained weights whose license forbids commercial use"
     )
     settings: tuple[Setting, ...] = Field(
         (), title="Further settings", description="one per item, as `motion.iterations=400`; the command's `--set`"
@@ -145,7 +146,11 @@ class Sides(Frozen):
         (), title="Views", description="one per item, AZIMUTH[,ELEVATION]=FILE in degrees, as `90=/data/in/right.png`"
     )
     turntable: str = Field("", title="Turntable", description="video of the still subject turned once, from its front")
-    cameras: str = Field("", title="Cameras", description="transforms.json of nerfstudio with pictures of one moment")
+    cameras: str = Field(
+        "",
+        title="Cameras",
+        description="transforms.json of nerfstudio: pictures of the first frame, or synchronized videos",
+    )
     asset: str = Field(
         "",
         title="Own model",
@@ -180,8 +185,8 @@ class Cutout(Frozen):
     layers: str = Field(
         "",
         title="Layers",
-        description="gray picture of the first frame, on the worker's machine: parts lighter than mid-gray lie before "
-        "the rest, darker ones behind it",
+        description="gray picture of the first frame, same size, on the worker's machine: lighter than mid-gray is "
+        "nearer, darker is farther",
     )
 
 
@@ -210,8 +215,8 @@ def picture_to_4d(
             object, as `s3://bucket/fox.png`. Cut-outs with a transparent background are best
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
         options: the defaults work on any machine
-        sides: pictures of other sides, which the subject is shaped and colored by; or a model of it
-        cutout: where the subject is, if it is not found, and what lies nearer
+        sides: pictures of other sides (they determine shape and colors), or a model
+        cutout: mask or box of the subject, if the automatic cut-out fails; depth hints
     """
     _convert(picture, out, options, sides, cutout)
 
@@ -231,8 +236,8 @@ def video_to_4d(
             `https://host/walk.mp4`; or an object, as `s3://bucket/walk.mp4`
         out: on the worker's machine, as `/data/out/walk`; open `report.html` there when it is done
         options: the defaults work on any machine
-        sides: pictures of other sides at the first frame, which the subject is shaped and colored by; or a model of it
-        cutout: where the subject is, if it is not found, and what lies nearer
+        sides: pictures of other sides in the first frame (they determine shape and colors), or a model
+        cutout: mask or box of the subject, if the automatic cut-out fails; depth hints
     """
     _convert(video, out, options, sides, cutout, is_video=True)
 
@@ -249,7 +254,8 @@ def model_to_4d(
     Args:
         model: a file on the worker's machine, as `/data/in/fox.glb`; also .gltf, .obj, .usdz, .ply and .spz
         out: on the worker's machine, as `/data/out/fox`; open `report.html` there when it is done
-        picture: of the model or a video of its motion, on the worker's machine; empty: the model's own render moves
+        picture: of the model, or a video of its motion, on the worker's machine; empty: the motion is generated from a
+            render of the model
         options: the defaults work on any machine
     """
     _start()
@@ -267,21 +273,21 @@ def catalog_to_4d(
     inputs: Annotated[Text, Field(json_schema_extra=_title("Pictures and videos"))],
     out: Folder,
     workers: Workers = 1,
-    where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Items run on"))] = "",
-    strict: Annotated[bool, Field(json_schema_extra=_title("Stop at a faulty asset"))] = False,
+    where: Annotated[str, Field(pattern=WHERE, json_schema_extra=_title("Where items run"))] = "",
+    strict: Annotated[bool, Field(json_schema_extra=_title("Stop at the first failed gate"))] = False,
     options: FormPictureOptions = PictureOptions(),  # noqa: B008 - frozen
 ) -> State[None]:
     """Convert many pictures and videos to an asset each; finished ones are skipped.
 
     Args:
-        inputs: on the worker's machine a folder, as `/data/in`, a pattern, as `/data/in/**/*.png`, or a list, as
-            `/data/in/list.csv`; or a place in an object store, as `s3://bucket/in/`
+        inputs: on the worker's machine a folder, as `/data/in`, a pattern, as `/data/in/**/*.png`, or a
+            manifest, as `/data/in/list.csv`; or a place in an object store, as `s3://bucket/in/`
         out: on the worker's machine, as `/data/out`; open `index.html` there when it is done
         workers: from 1 to 64; more than one is faster with enough cores, GPUs or machines
         where: `local` is this machine; `deployment:POOL` are the machines whose workers serve that pool, as `fleet`,
             and share the store of this one; `dask` the cluster that this machine knows; empty: as `$DG4D_RUNNER` says
         strict: an asset that fails a quality gate ends the batch; else it is marked, and the next one is started
-        options: for lines of a list that say nothing else; the defaults work on any machine
+        options: defaults for rows of a manifest that do not set them; they work on any machine
     """
     _start()
     roots = Roots.of_this_process()
@@ -329,7 +335,7 @@ def item_to_4d(
 def benchmark(
     dataset: Annotated[Text, Field(json_schema_extra=_title("Data set"))],
     out: Folder,
-    limit: Annotated[int, Field(ge=0, json_schema_extra=_title("Objects at most"))] = 0,
+    limit: Annotated[int, Field(ge=0, json_schema_extra=_title("Maximum number of objects"))] = 0,
     mesh: Annotated[bool, Field(json_schema_extra=_title("Score the meshes"))] = False,
     bank: Annotated[bool, Field(json_schema_extra=_title("Ground-truth views as the prior"))] = False,
     workers: Workers = 1,
@@ -339,8 +345,8 @@ def benchmark(
 
     Args:
         dataset: a folder on the worker's machine with a folder per object, as `/data/objects`
-        out: on the worker's machine, as `/data/out`; tables, films and packages
-        limit: the first so many by name; 0 for all of them
+        out: on the worker's machine, as `/data/out`; tables, videos and packages
+        limit: only the first N objects by name; 0: all
         mesh: score the textured meshes instead of the splats
         bank: use each object's ground-truth views as the prior, which measures the optimization alone
         workers: from 1 to 64; more than one is faster with enough cores or GPUs
@@ -362,12 +368,12 @@ def _run_name(source: str) -> str:
 
 
 def _start() -> None:
-    """Claim the run for this process; fail a run that was started too often, since it may be what kills its process."""
-    _patiently(claim_run)
+    """Claim the run for this process; fail a run that was restarted too often, since it may crash its process."""
+    _retry_until_server_answers(claim_run)
     if runtime.flow_run.run_count > MOST_STARTS:
         raise BackendUnavailable(
             f"this run was started {MOST_STARTS} times and did not end: find out what kills its process, for example "
-            "too little memory; then start a new run, which goes on after the last finished step"
+            "too little memory; then start a new run, which resumes after the last finished step"
         )
 
 
@@ -378,7 +384,7 @@ def _convert_item(job: ArtifactRef, code: str, address: str) -> Outcome:
         _start()
         wanted = read_job(job, code, store, address)
         Roots.of_this_process().check_weights(wanted.settings.model_dump(mode="json"))
-        _patiently(connect)
+        _retry_until_server_answers(connect)
         with sharing_results(store), tempfile.TemporaryDirectory(prefix="dg4d-item-") as scratch:
             folder = Path(scratch) / "package"
             _, cached = convert_job(wanted, folder)
@@ -429,11 +435,11 @@ def _publish(request: ConversionRequest, folder: Path) -> None:
     check_folder(folder, request.item)
     with stored(request) as job:
         if not is_up_to_date(folder, job.digest()):
-            _patiently(connect)
+            _retry_until_server_answers(connect)
             convert_job(job, folder, force=False)
 
 
-def _patiently(work: Callable[[], None]) -> None:
+def _retry_until_server_answers(work: Callable[[], None]) -> None:
     """Ask the server of this run, which may restart, until it answers.
 
     Raises:

@@ -49,7 +49,7 @@ def video_to_4d(job: Job, folder: Path | None = None, mesh_parts: int = 0) -> Fl
 
 @flow(name="text_to_4d", flow_run_name="{job.item}", persist_result=False)
 def text_to_4d(job: Job, folder: Path | None = None, mesh_parts: int = 0) -> FlowResult:
-    """Draw a picture from words and turn it into an animated 3D asset.
+    """Generate a picture from a prompt and turn it into an animated 3D asset.
 
     Raises:
         StepError: a step did not finish.

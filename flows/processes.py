@@ -67,7 +67,7 @@ def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iter
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     deadline = time.monotonic() + patience_s
-    with path.open("a") as file:
+    with path.open("a+") as file:  # NFS refuses shared locks on a descriptor that cannot read
         while True:
             try:
                 fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

@@ -176,7 +176,7 @@ def animate(
 def known_views(
     subject: Subject, source: ArtifactRef, job: ConversionJob, conversion: Conversion, tasks: Tasks
 ) -> KnownViews | None:
-    """Return views of other sides: the user's, else those that a model draws, else none."""
+    """Return views of other sides: the user's, else those that a model generates, else none."""
     if job.views is not None:
         return tasks.prepare_views(job.views, source, subject, conversion, job.mask)
     return tasks.generate_views(subject, conversion) if job.settings.views.kind != "none" else None

@@ -83,7 +83,7 @@ class Scores(StepResult):
 
 
 def draw_picture(text: ArtifactRef, conversion: Conversion) -> Picture:
-    """Draw a picture from words."""
+    """Generate a picture from a prompt."""
     return run_step("draw_picture", Picture, **locals())
 
 
@@ -110,7 +110,7 @@ def prepare_views(
 
 
 def generate_views(subject: Subject, conversion: Conversion) -> KnownViews:
-    """Draw views of other sides with an image-editing model and weight them by their agreement."""
+    """Generate views of other sides with an image-editing model and weight them by their agreement."""
     return run_step("generate_views", KnownViews, **locals())
 
 
@@ -204,7 +204,7 @@ def pack_asset(
 
 
 def check_asset(package: Package, driving_video: DrivingVideo, subject: Subject, conversion: Conversion) -> Verdict:
-    """Compare the package with the driving video and judge it by the quality gates."""
+    """Compare the package with the driving video and check the quality gates."""
     return run_step("check_asset", Verdict, **locals())
 
 

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+from dg4d_lib.errors import BackendUnavailable, BadInput, DG4DError
 from steps.contract import ArtifactRef
 
 
-class StepError(Exception):
+class StepError(DG4DError):
     """Failure of a step.
 
     Attributes:
@@ -23,11 +24,11 @@ class StepError(Exception):
         return type(self), (self.step, self.message, self.pictures)
 
 
-class StepBadInput(StepError):
+class StepBadInput(StepError, BadInput):
     """Unusable input; a retry fails again."""
 
 
-class StepMissing(StepError):
+class StepMissing(StepError, BackendUnavailable):
     """Missing library, device, weights or artifact."""
 
 

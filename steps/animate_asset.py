@@ -40,8 +40,8 @@ from steps.runtime.job import Job, StepReport
 
 PICTURE_FRAMES = 6
 NOTE = "The motion of sides that the video does not show follows from the rigidity of the surface."
-RIGID_NOTE = "The model moves as {} rigid part{}; this shows the video better than a surface that bends."
-JOINT_NOTE = "The skeleton of the model moves it; how limbs turn where the video does not show it is a guess."
+RIGID_NOTE = "The model was animated as {} rigid part{}, which matches the video better than a surface that bends."
+JOINT_NOTE = "The model is animated by its skeleton; rotations of limbs that the video does not show are guesses."
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _write_mesh(job: Job, mesh: PlacedMesh, motion: NodeMotion, fps: float, note
     job.outputs["moving"].write_bytes(content)
     merged, sources = merge_parts(mesh.glb.model.placed(mesh.placement.matrix), job.settings.texture_size)
     write_tracked(job.outputs["tracked"], TrackedMesh(merged, vertices[:, sources] - merged.vertices))
-    return [*notes, *([f"{flipped} faces are turned inside out over all frames"] if flipped else [])]
+    return [*notes, *([f"{flipped} faces are flipped, summed over all frames"] if flipped else [])]
 
 
 def _picture(states: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:

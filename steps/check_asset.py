@@ -189,7 +189,7 @@ def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:
 
 @dataclass(frozen=True)
 class _Rest:
-    """A mesh at rest, which its other moments are compared with.
+    """Rest pose of a mesh, the baseline for defects in other frames.
 
     Attributes:
         joined: vertices without copies along seams.

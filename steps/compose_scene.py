@@ -20,9 +20,10 @@ from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import concatenate, transform
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from steps.artifacts.packages import ASSET, COMPACT, MERGED, USD, read_file, read_manifest
+from steps.artifacts.rendering import fitted_positions
 
 FILM_SIZE = 384  # pixels of a side
-MOST_PICTURES = 300  # of a film; all are in memory until it is written
+MOST_PICTURES = 300  # of a preview video; all are in memory until it is written
 SWING_DEG = 25.0  # amplitude of the camera's azimuth
 ELEVATION_DEG = 10.0  # of the camera
 FILLED = 0.9  # part of the picture that the scene's bounding sphere fills
@@ -39,7 +40,7 @@ class SceneWriter:
         names: unique names in the scene.
 
     Raises:
-        BadInput: a folder is no package, or its asset cannot be placed in a scene.
+        BadInput: a folder is not a package, or its asset cannot be placed in a scene.
         BackendUnavailable: an asset is compressed, and the library that decodes it is not installed.
     """
 
@@ -81,10 +82,13 @@ class SceneWriter:
             if not (folder / USD).is_file():
                 raise BadInput(f"{folder} has no {USD}; make it again, or write the scene as .glb")
             transform, item = torch.from_numpy(actor.transform), actor.item
-            placements.append(UsdPlacement(actor.name, folder / USD, transform, item.start_s, item.speed))
-        compose_usdz(path, placements)
+            hold_s = None if item.loop else actor.glb.last_pose_s
+            placements.append(UsdPlacement(actor.name, folder / USD, transform, item.start_s, item.speed, hold_s))
+        compose_usdz(path, placements, length)
         again = [actor.name for actor in self.actors if actor.item.loop and actor.end_s < length]
-        return (f"USDZ plays every asset once; these would go on in a GLB: {', '.join(again)}",) if again else ()
+        return (
+            (f"USDZ cannot loop: these assets play once here, but loop in a GLB: {', '.join(again)}",) if again else ()
+        )
 
     def write_preview(
         self,
@@ -93,7 +97,7 @@ class SceneWriter:
         rasterizer: str = "auto",
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Write a film of the moving Gaussians, from a camera that swings once from side to side.
+        """Write a video of the moving Gaussians, from a camera that swings once from side to side.
 
         Args:
             path: file, ending in .mp4.
@@ -109,7 +113,8 @@ class SceneWriter:
         count = round(scene_duration(self.actors, scene.duration_s) * scene.fps)
         if not 1 <= count <= MOST_PICTURES:
             raise BadInput(
-                f"a film has 1 to {MOST_PICTURES} pictures; {count} were asked for: change fps or duration_s"
+                f"a preview video has 1 to {MOST_PICTURES} frames, this scene would need {count}: change fps or "
+                "duration_s"
             )
         draw = get_rasterizer(rasterizer)
         clouds = {folder: _MovingGaussians(folder) for folder in dict.fromkeys(self.folders)}
@@ -159,9 +164,11 @@ class _MovingGaussians:
 
 
 def _body(folder: Path) -> AnimatedGlb:
-    name = MERGED if read_manifest(folder).mode == "own" else ASSET
+    manifest = read_manifest(folder)
+    name = MERGED if manifest.mode == "own" else ASSET
     content = read_file(folder, name)
+    _, last = fitted_positions(2, folder, manifest).tolist()
     try:
-        return AnimatedGlb(content)
+        return AnimatedGlb(content, return_s=(manifest.frames - last) / manifest.fps)
     except BadInput as error:
         raise BadInput(f"{folder / name}: {error}") from error

@@ -40,8 +40,8 @@ RUN_ONLY = frozenset(  # fields of a record that its digest leaves out
 
 NO_LIST = {"list_type", "tuple_type"}  # errors of pydantic, as the next ones
 NO_NUMBER = {
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "is no whole number"),
-    **dict.fromkeys(("float_type", "float_parsing"), "is no number"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "is not a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "is not a number"),
 }
 OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 NUMBERS = re.compile(r"[-+.,0-9e ]{1,60}")  # one or several, with commas

@@ -147,8 +147,8 @@ def run(job: Job) -> StepReport:
         lost = _lost_frames(tracked, states, video, rasterize) if video and settings.mode == "auto" else 0
         if lost > LOST_SHARE * frames:
             write_plan(job.outputs["plan"], MeshPlan(mode="per_frame", level=plan.level, grid=plan.grid))
-            note = f"one mesh loses {lost} of {frames} frames (the Gaussians are {LOST_DB:g} dB closer to the video)"
-            return _report(job, mesh, weights, [*notes, f"{note}: every frame gets its own"])
+            note = f"one mesh is {LOST_DB:g} dB or more worse than the Gaussians in {lost} of {frames} frames"
+            return _report(job, mesh, weights, [*notes, f"{note}; a mesh per frame is used"])
         if guesses is not None and video and settings.mirror_texture:
             plane = guessed_mirror(video, round(tracked.reference_frame))
             tracked, share = mirrored(tracked, video, plane)
@@ -162,7 +162,7 @@ def run(job: Job) -> StepReport:
         reference, agreement = tracked.reference_frame, f"{ious.mean():.1%} (IoU), {ious.min():.1%} at worst"
         notes = [
             f"one mesh for {frames} frames: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles",
-            f"at rest the mesh is {_check(mesh)}",
+            f"in the reference frame the mesh is {_check(mesh)}",
             f"the mesh is the {kind} of frame {reference:g}, which follows the {FOLLOWED[plan.guide]} best",
             *notes,
             f"the mesh's outlines agree with {OUTLINES[plan.guide]} to {agreement}",
@@ -172,7 +172,7 @@ def run(job: Job) -> StepReport:
     else:
         first, end = frames_of_task.first_frame, frames_of_task.end_frame or frames
         if not first < end <= frames:
-            raise BadInput(f"frames {first} to {end} were asked for; the motion has {frames}")
+            raise BadInput(f"frames {first} to {end} were requested; the motion has {frames}")
         meshes = {}
         for frame in range(first, end):
             meshes[frame] = textured_mesh(states.at(frame), plan.level, rasterize, settings, frame_at(video, frame))
@@ -270,7 +270,7 @@ def _tracked(
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     if video is not None:
         mesh = textured(mesh, vertices + offsets)
-    notes = [f"a trial mesh of frame {frame} had {plan.followed:.1%} IoU", *_note(strands), *separated]
+    notes = [_trial_note(plan), *_note(strands), *separated]
     return TrackedMesh(mesh, offsets[:, sources], reference_frame=frame), ious, notes
 
 
@@ -293,13 +293,13 @@ def _guided(
         offsets = follow_video(rest.vertices, rest.faces, states, video, frame, rasterize, generator)
         candidates.append(Candidate(frame, rest, offsets))
         job.progress(1 + len(candidates), 3 + len(plan.other_candidates), {})
-    notes = [f"a trial mesh of frame {plan.reference_frame} had {plan.followed:.1%} IoU"]
+    notes = [_trial_note(plan)]
     best = candidates[0]
     if plan.other_candidates:
         scores = [_psnr(candidate, settings, video) for candidate in candidates]
         best = candidates[scores.index(max(scores))]
         listed = ", ".join(f"frame {one.frame} {score:.1f} dB" for one, score in zip(candidates, scores, strict=True))
-        notes.append(f"tracked, before registration: {listed} (PSNR at the input view)")
+        notes.append(f"PSNR at the input view after tracking, before registration: {listed}")
     vertices, faces, draw = best.rest.vertices, best.rest.faces, best.rest.draw
     offsets = register_tracking(
         vertices, best.offsets, faces, states, video, best.frame, level, rasterize, settings
@@ -322,11 +322,15 @@ def _guided(
     return tracked, silhouette_iou(moved, faces, silhouettes), [*notes, *_note(strands), *separated]
 
 
+def _trial_note(plan: MeshPlan) -> str:
+    """Return a note with the agreement of the trial mesh that the reference frame was chosen by."""
+    return f"trial mesh of frame {plan.reference_frame}: {plan.followed:.1%} silhouette IoU over the motion"
+
+
 def _note(strands: tuple[Tube, ...]) -> list[str]:
     """Return a note with the number of strands, if the mesh has any."""
-    return (
-        [f"strands of the video that are too thin for its grid and grew out of it: {len(strands)}"] if strands else []
-    )
+    added = f"added thin parts (such as antennae) that are narrower than a cell of mesh.grid: {len(strands)}"
+    return [added] if strands else []
 
 
 def _psnr(candidate: Candidate, settings: MeshSettings, video: DrivingVideo) -> float:
@@ -358,8 +362,8 @@ def _sound(
     targets.
     """
     separated, frames = separate(vertices, offsets, faces, silhouettes, video is not None and is_loop(video))
-    places = f"parts that had sunk into each other in {frames} of {len(offsets)} frames"
-    notes = [f"{places} were moved apart, as far as outlines allow"] if frames else []
+    places = f"intersecting parts in {frames} of {len(offsets)} frames"
+    notes = [f"{places} were separated, as far as the outlines allow"] if frames else []
     if video is not None and strands:
         separated = find_strands_again(vertices, separated, faces, strands, video.alpha[..., 0])
     turned = turn_back(vertices, separated, faces, silhouettes)

@@ -18,8 +18,8 @@ from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_d
 from steps.fitting.tracking import TRACKED_NOTE, SurfaceTracker, most_iterations, tracks_surface
 from steps.runtime.job import Job, StepReport
 
-STRAYS = "Gaussians that tore away from the moving subject and were dropped: {}."
-FINE_TUNED = "The Gaussians at rest were fitted to the whole video together with their motion."
+STRAYS = "Removed {} stray Gaussians that separated from the moving subject."
+FINE_TUNED = "The canonical Gaussians were optimized together with the deformation, on all frames."
 PICTURE_FRAMES = 6
 STATES = 16  # at once in the memory, where strays are searched
 FRONT_DEG, SIDE_DEG = 0.0, 90.0

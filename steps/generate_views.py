@@ -1,4 +1,4 @@
-"""Step that draws views of other sides of the subject, and weights them by their agreement."""
+"""Step that generates views of other sides of the subject, and weights them by their agreement."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,14 +28,15 @@ FADED = 0.85  # of white, over a view of weight 0 in the picture
 
 
 def run(job: Job) -> StepReport:
-    """Write the bank of drawn views with their weights, and a picture of them.
+    """Write the bank of generated views with their weights, and a picture of them.
 
     Raises:
-        BadInput: no model is set, the subject cannot be found in any drawn picture, or no view agrees with the input.
+        BadInput: no model is set, the subject cannot be found in any generated picture, or no view agrees with the
+            input.
         BackendUnavailable: weights or libraries of the models are not installed.
     """
     if isinstance(job.settings.views, NoViewsSettings):
-        raise BadInput("views.kind=none draws no views; use --set views.kind=image_edit, or leave this step out")
+        raise BadInput("views.kind=none generates no views; use --set views.kind=image_edit, or leave this step out")
     settings: ImageEditViewsSettings = job.settings.views
     subject = read_png(job.inputs["subject"])
     device, directions = default_device(), directions_of(settings)
@@ -52,7 +53,7 @@ def run(job: Job) -> StepReport:
     write_png(job.outputs["picture"], picture_of(front, kept))
     write_png(job.pictures / "views.png", picture_of(front, kept))
     write_bank(job.outputs["known_views"], [kept], job.pictures)
-    drawn = f"{len(kept)} views of other sides were drawn by a model ({settings.weights}); they are guesses."
+    made = f"{len(kept)} views of other sides were generated ({settings.weights}); they are guesses."
     weights, licenses = dict(network.digests), dict(network.licenses)
     for one in opened:
         weights.update(one.digests)
@@ -62,7 +63,7 @@ def run(job: Job) -> StepReport:
         f"{device.type} (diffusers)",
         weights,
         licenses,
-        notes=(drawn, *notes, *more, *judgment_notes(views, judgments), *named),
+        notes=(made, *notes, *more, *judgment_notes(views, judgments), *named),
         run_notes=offload_notes(offload),
     )
 
@@ -74,7 +75,7 @@ def cut_views(
     matting: str,
     segmenter: Segmenter,
 ) -> tuple[list[KnownView], tuple[str, ...]]:
-    """Cut the subject out of drawn pictures, centered; pictures without a subject are left out with a note.
+    """Cut the subject out of generated pictures, centered; pictures without a subject are left out with a note.
 
     Raises:
         BadInput: no picture shows a subject.
@@ -83,7 +84,7 @@ def cut_views(
     views: list[KnownView] = []
     failed: list[str] = []
     for picture, direction in zip(pictures, directions, strict=True):
-        name = f"drawn view at azimuth {direction.azimuth_deg}, elevation {direction.elevation_deg}"
+        name = f"generated view at azimuth {direction.azimuth_deg}, elevation {direction.elevation_deg}"
         opaque = torch.cat([picture, torch.ones_like(picture[..., :1])], -1)[None]
         try:
             cutout = prepare_subject(opaque, False, settings, segmenter=segmenter).frames[0]
@@ -93,7 +94,7 @@ def cut_views(
         views.append(known_view(cutout, direction.azimuth_deg, direction.elevation_deg, name))
     if not views:
         raise BadInput(
-            f"no drawn picture shows the subject ({failed[0]}); change the seed or views.weights, or use "
+            f"no generated picture shows the subject ({failed[0]}); change the seed or views.weights, or use "
             "views.kind=none"
         )
     return views, tuple(failed)
@@ -116,10 +117,12 @@ def weighted_views(
     ]
     if not kept:
         raise BadInput(
-            f"none of the {len(views)} drawn views agrees with the input and the others; change the seed or "
+            f"none of the {len(views)} generated views agrees with the input and the others; change the seed or "
             "views.weights, lower views.min_weight, or use views.kind=none"
         )
-    notes = ("The drawn views count azimuths the other way around; they were mirrored in place.",) if mirrored else ()
+    notes = (
+        ("The generated views have azimuths of the opposite sign; their azimuths were negated.",) if mirrored else ()
+    )
     adjusted = adjust_exposure([front, *kept])
     return adjusted[1:], judgments, notes
 
@@ -131,7 +134,7 @@ def judgment_notes(views: Sequence[KnownView], judgments: Sequence[Judgment]) ->
         for view, one in zip(views, judgments, strict=True)
         if one.weight < CARVES
     ]
-    return (f"drawn views that disagree with the others count little: {'; '.join(low)}",) if low else ()
+    return (f"generated views that contradict the others have a low weight: {'; '.join(low)}",) if low else ()
 
 
 def picture_of(front: KnownView, views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:

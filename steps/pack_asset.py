@@ -114,7 +114,7 @@ class PackageWriter:
                 name = packages.MERGED
             content = write_glb(surface, gltf)
             self.path(name).write_bytes(content)
-            return notes + component_notes(name, content)
+            return notes + component_notes(name, content, self.placement.scale)
         self.path(packages.ASSET).write_bytes(write_frames_glb(surface, self.fps, _extras(self.notes), gltf))
         for frame, mesh in enumerate(surface):
             self.path(f"{packages.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
@@ -146,14 +146,14 @@ class PackageWriter:
         pack, surface, rig, notes = self.pack, self.surface, None, tuple[str, ...]()
         about = _extras(self.notes)
         if pack.rig and isinstance(surface, Asset4D):
-            rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error)
+            rig, note = fit_asset_rig(surface, pack.rig_bones, pack.rig_error, self.placement.scale)
             notes = (note,)
         if isinstance(surface, Asset4D) and rig is not None:
             precise = rig.rms <= PRECISE * self.placement.scale
             path = self.path(packages.RIGGED if precise else packages.PLAYBACK)
             path.write_bytes(write_rigged_glb(surface, rig, pack.gltf))
             if not precise:
-                notes = (f"{note}; it is for playback, in {path.name}, and asset.glb is exact",)
+                notes = (f"{note}; it is for playback only, in {path.name}, and asset.glb is exact",)
             if pack.usd:
                 write_skinned_usdz(self.path(packages.USD), surface, rig, about, pack.gltf)
         elif pack.usd:
@@ -184,11 +184,11 @@ class PackageWriter:
         for name, port in ((packages.GAUSSIANS, "gaussians"), (packages.SUBJECT, "subject")):
             shutil.copyfile(self.inputs[port], self.path(name))
         write_compact(self.path(packages.COMPACT), self.fit)
-        even = self.video.frames.shape[1] // 2 * 2  # pixels; some players cannot show films of odd sizes
+        even = self.video.frames.shape[1] // 2 * 2  # pixels; some players cannot show videos of odd sizes
         write_mp4(self.path(packages.DRIVING), self.video.over(torch.ones(3))[:, :even, :even], self.video.fps)
 
     def write_preview(self) -> Sequence[str]:
-        """Write the film of the motion, as splats and as a lit mesh, with a camera that goes round."""
+        """Write the video of the motion, as splats and as a lit mesh, with an orbiting camera."""
         return write_preview(self.path(packages.PREVIEW), *self._motion, self.points, self._mesh_at_frame)
 
     def write_moving_picture(self) -> None:
@@ -206,7 +206,7 @@ class PackageWriter:
         return fit.gaussians, fit.deformation, fit.frames, fit.fps, self.rasterizer, self.pack
 
     def write_turntable(self) -> Sequence[str]:
-        """Write the film of the first frame on a turntable."""
+        """Write the video of the first frame on a turntable."""
         fit = self.fit
         first = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, torch.zeros(1)).at(0)
         return write_turntable(self.path(packages.TURNTABLE), first, self.rasterizer, self.pack)
@@ -348,7 +348,7 @@ def _delit(surface: Surface) -> Surface:
 def _check_frames(expected: int, given: dict[str, int]) -> None:
     wrong = [f"{name} {count}" for name, count in given.items() if count != expected]
     if wrong:
-        raise BadInput(f"the driving video has {expected} frames, but: {', '.join(wrong)}; run the steps before again")
+        raise BadInput(f"the driving video has {expected} frames, but: {', '.join(wrong)}; run the earlier steps again")
 
 
 def _extras(notes: Sequence[str]) -> dict[str, Any]:

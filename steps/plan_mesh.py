@@ -39,7 +39,7 @@ def run(job: Job) -> StepReport:
     mode, frame, followed, notes, grid = settings.mode, 0, 1.0, [], None
     if mode == "auto" and isinstance(read_motion(job.inputs["motion"]).deformation, OnParts):
         mode = "per_frame"
-        notes.append("a part opens about a hinge and shows what the first frame hides: every frame gets its own mesh")
+        notes.append("a part opens about a hinge and reveals a surface that frame 0 hides; a mesh per frame is used")
     others: tuple[int, ...] = ()
     guide: Literal["gaussians", "video"] = "gaussians"
     weights: dict[str, str] = {}
@@ -66,8 +66,8 @@ def run(job: Job) -> StepReport:
         mode = "tracked" if followed >= least else "per_frame"
         if mode == "per_frame":
             notes.append(
-                f"one mesh does not follow this motion ({followed:.1%} IoU on trial, mesh.{LIMITS[guide]} asks for "
-                f"{least:.0%}): every frame gets its own"
+                f"one mesh does not follow this motion (trial mesh: {followed:.1%} IoU, mesh.{LIMITS[guide]} requires "
+                f"{least:.0%}); a mesh per frame is used"
             )
             frame, guide, others = 0, "gaussians", ()
     job.progress(1, 2, {})
@@ -79,7 +79,7 @@ def run(job: Job) -> StepReport:
         if found[1] > agreement + FINER_GAIN:
             (level, agreement), grid = found, finer.grid
             notes.append(
-                f"thin parts: the density field has {grid} samples along every axis (mesh.grid={settings.grid})"
+                f"thin parts need a finer grid: {grid} instead of {settings.grid} samples per axis (mesh.grid)"
             )
     guessed = settings.source == "prior" and {"driving_video", "subject"} <= job.inputs.keys()
     if mode == "per_frame" or not guessed:  # else the mesh is the shape network's surface

@@ -137,7 +137,7 @@ def _disagreement(placement: Placement, settings: AssetSettings) -> str:
     return (
         f"the model does not agree with the first frame: their outlines overlap by {placement.agreement:.0%} (IoU) at "
         f"best, from azimuth {placement.azimuth_deg:.0f}; asset.min_agreement = {settings.min_agreement:g} is needed. "
-        "Give the video of this very model, say the azimuth with --asset-azimuth, or lower the setting"
+        "Give the video of this very model, give the azimuth with --asset-azimuth, or lower the setting"
     )
 
 
@@ -156,7 +156,7 @@ def _notes(own: OwnModel, placement: Placement, job: Job) -> list[str]:
             f"by {placement.agreement:.1%} (IoU)"
         )
     else:
-        notes.append("the picture that is set in motion is a render of the model")
+        notes.append("the picture that is animated is a render of the model")
     return notes
 
 

@@ -81,14 +81,15 @@ def read_hint(job: Job, source: Source, prepared: PreparedSubject) -> tuple[Dept
 
 
 def turn_note(turn_deg: float) -> str:
-    """Return the sentence about a turn that was found, in degrees; below half a degree the line counts as level."""
-    found, turn = "it is level", "not to be turned"
-    if degrees := round(abs(turn_deg)):
-        found = f"its {'right' if turn_deg > 0 else 'left'} end is nearer"
-        turn = f"to be turned by about {degrees} degrees"
+    """Return the sentence about an estimated yaw, in degrees; below half a degree it counts as 0."""
+    estimate = "estimated yaw of the subject, from where it touches the ground"
+    degrees = round(abs(turn_deg))
+    if not degrees:
+        return f"{estimate}: 0 degrees"
     return (
-        f"ground line of the footage: {found}, so priors without weights take the subject {turn} if no other views are "
-        "given; `subject.turn_deg` overrides it, `subject.ground_turn=0` ignores it"
+        f"{estimate}: {degrees} degree{'s' * (degrees > 1)}, {'right' if turn_deg > 0 else 'left'} end nearer; used by "
+        "prior.kind=geometric and learned if no other views are given (subject.turn_deg overrides it, "
+        "subject.ground_turn=0 disables it)"
     )
 
 

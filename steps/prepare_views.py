@@ -113,7 +113,7 @@ class _Reader:
         if all(moving):
             return self._moving(given, sources)
         if any(moving):
-            raise BadInput("--cameras names pictures and videos; give either pictures of one moment, or videos of all")
+            raise BadInput("--cameras mixes pictures and videos; give only pictures or only videos")
         if given.input_camera is not None:
             placed = self._placed(given, sources, self._source(), self.inputs[:1])
             return [[frames[0] for frames in placed]], ()
@@ -232,12 +232,12 @@ def check_turn(source: Source) -> None:
     from_first = (color - color[:1]).abs().mean((1, 2, 3))
     steps = color.diff(dim=0).abs().mean((1, 2, 3))
     if float(from_first.max()) < STILL:
-        raise BadInput(f"{TURNTABLE} shows no turn: its frames are alike; film the still subject turned once")
+        raise BadInput(f"{TURNTABLE} shows no turn: its frames are alike; record the still subject, turned once")
     gap = source.count - 1 - evenly_spaced(source.count, TURNTABLE_FRAMES)[-2]
     if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / gap):
         raise BadInput(
-            f"{TURNTABLE} is no whole turn: its last frame is unlike its first; film one turn, cut right before the "
-            "first picture comes back"
+            f"{TURNTABLE} is not a whole turn: its last frame is unlike its first; record one turn, and cut right "
+            "before the first picture repeats"
         )
 
 
@@ -254,19 +254,21 @@ def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
         BadInput: a view shows something else.
     """
     lowest = min(found.filled)
-    share, least = (found.mean, LEAST_MEAN) if len(views) > FEW and found.odd is None else (lowest, LEAST_FILLED)
+    many = len(views) > FEW and found.odd is None
+    share, least = (found.mean, LEAST_MEAN) if many else (lowest, LEAST_FILLED)
     if share < least:
         named = f"{_place(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
+        filled = "of the silhouettes" if many else "of one silhouette"
         raise BadInput(
-            f"the views do not show one subject from their azimuths: {named}; only {share:.0%} of a silhouette, at "
-            f"least {least:.0%}, agrees with the rest. Check the pictures and the azimuths: 90 is the side that the "
-            "input shows on the right, 180 the back"
+            f"the views do not show one subject from the given azimuths: {named}; their common visual hull fills only "
+            f"{share:.0%} {filled}, at least {least:.0%} is needed. Check the pictures and the azimuths: 90 is the "
+            "side that the input shows on the right, 180 the back"
         )
     if found.odd is None:
         return ()
     return (
-        f"{_place(views[found.odd])} contradicts the other views: they fill {lowest:.0%} of a silhouette; check it in "
-        "the picture of prepare_views",
+        f"{_place(views[found.odd])} contradicts the other views: the common visual hull fills only {lowest:.0%} of "
+        "one silhouette; see the picture of the step prepare_views",
     )
 
 

@@ -184,8 +184,8 @@ class ScoreAssetSettings(Settings):
     """Settings of `score_asset`, which reads no settings of the pipeline."""
 
     rasterizer: Backend
-    mesh: bool = Field(False, description="the textured mesh is judged instead of the splats")
-    actionbench: bool = Field(False, description="compare meshes by the metrics of ActionBench, too")
+    mesh: bool = Field(False, description="the textured mesh is scored instead of the splats")
+    actionbench: bool = Field(False, description="also compare meshes by the metrics of ActionBench")
     score: ScoreSettings = ScoreSettings()
 
 

@@ -39,7 +39,7 @@ from steps.sources.stills import MOST_PIXELS, StillPicture, read_still
 
 FOREGROUND = 0.5  # alpha from which a pixel belongs to the subject
 NEARLY_WHITE = 0.98  # in opaque pictures, the subject has a channel below this
-FILM_SIZE, FILM_FPS = 256, 12.0  # largest side in pixels, and frame rate, of the films
+FILM_SIZE, FILM_FPS = 256, 12.0  # largest side in pixels, and frame rate, of the videos
 DIGITS = 6  # decimals of every number
 
 Metrics = dict[str, float]
@@ -112,7 +112,7 @@ class MetricNetworks:
 
 
 def run(job: Job) -> StepReport:
-    """Write the scores of the package, or of naive baselines if there is none, and a film of every view.
+    """Write the scores of the package, or of naive baselines if there is none, and a video of every view.
 
     Raises:
         BadInput: the package or the ground truth cannot be used.
@@ -127,7 +127,7 @@ def run(job: Job) -> StepReport:
         else:
             report, films = _score_baselines(job, truth, networks)
         if networks.i3d is not None and report["frames"] < MIN_FRAMES:
-            shortage = f"I3D needs films of {MIN_FRAMES} frames or more; these have {report['frames']}"
+            shortage = f"I3D needs videos of {MIN_FRAMES} frames or more; these have {report['frames']}"
             networks.missing["fvd_consistent4d"] = shortage
         _write_films(job.outputs["films"], films, scratch)
     text = json.dumps({**report, "missing": networks.missing}, allow_nan=False)
@@ -226,7 +226,9 @@ def _report(
     frames = len(truth.views[0].frames) if truth.views else len(truth.inputs)
     first = (truth.inputs[0], *(view.frames[0] for view in truth.views))
     opaque = [path.parent.name for path in first if not _decode(path).has_alpha]
-    notes = [f"masks of the truth are guessed, its pictures are opaque: {', '.join(opaque)}"] if opaque else []
+    notes = (
+        [f"ground-truth masks are estimated, because these pictures are opaque: {', '.join(opaque)}"] if opaque else []
+    )
     features = {name: clip.tolist() for name, clip in clips.items() if clip is not None}
     return {"frames": frames, "size": size, "rows": dict(rows), "clips": features, "notes": notes}
 

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dg4d_lib.errors import BadInput
+
 FOV_Y_DEG = 49.1  # degrees, on both axes; DreamGaussian's camera (Tang et al. 2024)
 RADIUS = 2.0  # world units
 
@@ -22,10 +24,13 @@ class OrbitCamera:
     Attributes:
         elevation_deg: angle above the horizon, -90 to 90.
         azimuth_deg: counter-clockwise seen from above, 0 on +z, 90 on +x.
-        radius: distance from the origin, world units.
-        fov_y_deg: vertical field of view.
-        width: image width, pixels.
-        height: image height, pixels.
+        radius: distance from the origin, world units, above 0.
+        fov_y_deg: vertical field of view, between 0 and 180.
+        width: image width, pixels, at least 1.
+        height: image height, pixels, at least 1.
+
+    Raises:
+        BadInput: a value is out of range or not finite.
     """
 
     elevation_deg: float = 0.0
@@ -34,6 +39,17 @@ class OrbitCamera:
     fov_y_deg: float = FOV_Y_DEG
     width: int = 256
     height: int = 256
+
+    def __post_init__(self) -> None:  # kernels trust these values: an image without pixels ends the process
+        if not (math.isfinite(self.elevation_deg) and math.isfinite(self.azimuth_deg)):
+            raise BadInput(f"the angles of a camera must be finite; given {self.elevation_deg}, {self.azimuth_deg}")
+        if not (0 < self.radius < math.inf and 0 < self.fov_y_deg < 180):
+            raise BadInput(
+                "a camera must have a finite radius above 0 and a field of view between 0 and 180 degrees; given "
+                f"{self.radius} and {self.fov_y_deg}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise BadInput(f"an image must have at least 1 x 1 pixels; given {self.width} x {self.height}")
 
     @property
     def focal(self) -> float:

@@ -1,4 +1,4 @@
-"""A deformation on top of rigid parts: a field need not tear at the seam of a lid that opens."""
+"""Deformation field on top of rigid parts, so that the field stays smooth where a lid opens."""
 
 import torch
 from jaxtyping import Float, Int
@@ -74,13 +74,13 @@ class OnParts(nn.Module):
         return Displacement(added.means + moved - means, added.log_scales, added.quats + turned - self.rest)
 
     def grid_parameters(self) -> list[nn.Parameter]:
-        """Return those of the field."""
+        """Return the grid parameters of the field."""
         return self.field.grid_parameters()
 
     def length_parameters(self) -> list[nn.Parameter]:
-        """Return those of the field."""
+        """Return the length parameters of the field."""
         return self.field.length_parameters()
 
     def regularization_loss(self) -> Float[Tensor, ""]:
-        """Return that of the field."""
+        """Return the regularization loss of the field."""
         return self.field.regularization_loss()

@@ -188,7 +188,9 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
     except UNREADABLE as error:
         raise BadInput(f"{file} cannot be read: {_first_line(error)}") from error
     if other := [key for key, value in tensors.items() if not (isinstance(key, str) and isinstance(value, Tensor))]:
-        raise BadInput(f"{file} is no file of named tensors: {quoted(other[0])} is none; give the weights alone")
+        raise BadInput(
+            f"{file} is not a file of named tensors: {quoted(other[0])} is not a tensor; give the weights alone"
+        )
     return tensors
 
 
@@ -203,7 +205,7 @@ def read_linear(folder: Path, name: str, placement: Placement) -> nn.Linear:
     weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
     if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:
         shapes = {key: tuple(value.shape) for key, value in tensors.items()}
-        raise BadInput(f"{file} is no linear layer {name}.weight, {name}.bias; it has {shapes}")
+        raise BadInput(f"{file} is not a linear layer {name}.weight, {name}.bias; it has {shapes}")
     layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
     layer.load_state_dict({"weight": weight.to(placement.dtype), "bias": bias.to(placement.dtype)}, assign=True)
     return frozen(layer, placement)

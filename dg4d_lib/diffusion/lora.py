@@ -57,7 +57,7 @@ def merge_lora(network: nn.Module, path: Path, scale: float) -> int:
         scale: strength.
 
     Raises:
-        BadInput: the file is no LoRA, holds more than a LoRA's factors and alphas, or belongs to another network; or
+        BadInput: the file is not a LoRA, holds more than a LoRA's factors and alphas, or belongs to another network; or
             a number in it is not finite.
     """
     file = lora_file(path)
@@ -101,7 +101,7 @@ def _read_factors(file: Path) -> dict[str, _Factors]:
         elif not key.endswith(".alpha") or tensor.numel() != 1:
             others.append(key)
     if not down or set(down) != set(up) or any(one.ndim != 2 for one in (*down.values(), *up.values())):
-        raise BadInput(f"{file} is no LoRA of linear layers; give one that was made for this network")
+        raise BadInput(f"{file} is not a LoRA of linear layers; give one that was made for this network")
     adapter = _read_adapter(file)
     if others or adapter.use_dora:
         rest = f"{quoted(min(others))} ({len(others)} such tensors)" if others else "use_dora in its metadata"

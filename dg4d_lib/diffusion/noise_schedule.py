@@ -100,7 +100,7 @@ def read_schedule(model: Path) -> BetaSchedule:
     except FileNotFoundError as error:
         raise BadInput(f"{file} is missing; give weights in the layout of diffusers") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(f"{file} is no scheduler configuration of diffusers: {error!r}") from error
+        raise BadInput(f"{file} is not a scheduler configuration of diffusers: {error!r}") from error
 
 
 def require_schedule(model: Path, expected: BetaSchedule) -> None:

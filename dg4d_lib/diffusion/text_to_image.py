@@ -79,12 +79,12 @@ def _load(model: Path, dtype: torch.dtype) -> Any:
     """Load the pipeline of model_index.json.
 
     Raises:
-        BadInput: there is none, it cannot be read, or it is no text-to-image pipeline.
+        BadInput: there is none, it cannot be read, or it is not a text-to-image pipeline.
     """
     pipeline = load_pipeline(model, dtype)
     parameters = call_parameters(pipeline)
     required = [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
     other = [name for name in required if name not in ("prompt", "kwargs")]
     if "prompt" not in parameters or "image" in parameters or other:
-        raise BadInput(f"{type(pipeline).__name__} in {model} is no text-to-image pipeline; choose one that is")
+        raise BadInput(f"{type(pipeline).__name__} in {model} is not a text-to-image pipeline; choose one that is")
     return pipeline

@@ -79,7 +79,7 @@ class ViewDrawer:
         """
         pipeline = load_pipeline(model, compute_dtype(device, settings.precision), **_processor(model))
         if not {"image", "prompt"} <= set(call_parameters(pipeline)) or "num_frames" in call_parameters(pipeline):
-            raise BadInput(f"{type(pipeline).__name__} in {model} is no image-editing pipeline; choose one that is")
+            raise BadInput(f"{type(pipeline).__name__} in {model} is not an image-editing pipeline; choose one that is")
         if lora is not None:
             merge_lora(pipeline.transformer, lora, settings.lora_scale)
         return cls(settings, model, pipeline, place_pipeline(pipeline, device, settings.memory_gb))

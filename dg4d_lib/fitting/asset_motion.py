@@ -88,7 +88,7 @@ def iterations(settings: AssetSettings, frames: int) -> int:
 
 
 def report_after(report: Report, before: int, done: int, values: dict[str, float]) -> None:
-    """Report iterations of a fit that others came before."""
+    """Report iterations, offset by those of earlier fits."""
     report(before + done, values)
 
 
@@ -139,7 +139,7 @@ def _first_pose(fit: AssetFit, tracker: FlowTracker) -> Pose:
     """Return the pose at the first frame, with the colors of the Gaussians fitted to it.
 
     It is that at rest if colors, opacities and sizes explain the frame: outlines that differ, as by holes of a texture
-    or gaps between the Gaussians, are no motion, and would become motion in depth at all frames.
+    or gaps between the Gaussians, are not motion, and would become motion in depth at all frames.
     """
     rest, unmatched = Pose.rest(len(fit.graph.nodes)), tracker.cloud
     tracker.cloud = fit.match_first_frame(rest)

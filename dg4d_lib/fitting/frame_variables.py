@@ -1,4 +1,4 @@
-"""Base of the variables that motions are fitted by."""
+"""Base class of the per-frame variables of a motion fit."""
 
 from collections.abc import Sequence
 from typing import TypeVar

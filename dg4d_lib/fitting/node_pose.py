@@ -43,7 +43,7 @@ class Pose:
         index: Int[np.ndarray, "n k"],
         weights: Float[np.ndarray, "n k"],
     ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k 3"]]:
-        """Return what its nodes add to each moved point, the sum of which it is, and its turned offsets from them.
+        """Return each node's weighted contribution to the point, and the rotated offset from the node to the point.
 
         Args:
             points: at rest.

@@ -180,7 +180,7 @@ def draw_view(known: Sequence[KnownView], generator: torch.Generator) -> int:
 def adapt_density(
     cloud: _Cloud, grad2d: Grad2dStats, step: int, settings: StaticSettings, generator: torch.Generator
 ) -> bool:
-    """Densify and prune if it is time to, and only prune after the last iteration; return whether it was."""
+    """Densify and prune if it is time to, and only prune after the last iteration; return whether the cloud changed."""
     if step == settings.iterations >= settings.densify_every:  # new Gaussians would stay as they were copied
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, LAST_PRUNE * settings.prune_scale))
         return True

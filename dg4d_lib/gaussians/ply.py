@@ -79,7 +79,9 @@ def read_ply(path: Path, *, y_down: bool = False) -> Gaussians:
     names = dtype.names or ()
     missing = [name for name in COLUMNS if name not in names and name not in NORMALS]
     if missing:
-        raise BadInput(f"{path.name} is no splat PLY: it lacks {', '.join(missing)}; required are {', '.join(COLUMNS)}")
+        raise BadInput(
+            f"{path.name} is not a splat PLY: it lacks {', '.join(missing)}; required are {', '.join(COLUMNS)}"
+        )
     if any(name.startswith("f_rest_") for name in names):
         raise BadInput(f"{path.name} holds color of a higher degree (f_rest_*); save it with degree 0")
     if len(content) < start + count * dtype.itemsize:
@@ -142,7 +144,7 @@ def parse_header(name: str, beginning: bytes) -> tuple[int, np.dtype[np.void], i
         beginning: first bytes of the file.
 
     Raises:
-        BadInput: it is no binary PLY that begins with the element `vertex`.
+        BadInput: it is not a binary PLY that begins with the element `vertex`.
     """
     elements, start = parse_elements(name, beginning)
     if not elements or elements[0][0] != "vertex":
@@ -163,11 +165,11 @@ def parse_elements(name: str, beginning: bytes) -> tuple[list[tuple[str, int, np
         beginning: first bytes of the file.
 
     Raises:
-        BadInput: it is no binary PLY, or its first element has rows of varying length.
+        BadInput: it is not a binary PLY, or its first element has rows of varying length.
     """
     header = _HEADER.match(beginning)
     if header is None:
-        raise BadInput(f"{name} is no PLY: it must start with 'ply' and have an 'end_header' line")
+        raise BadInput(f"{name} is not a PLY: it must start with 'ply' and have an 'end_header' line")
     lines = [line.split() for line in header[1].decode("ascii", "replace").splitlines()]
     lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
     if ["format", "binary_little_endian", "1.0"] not in lines:

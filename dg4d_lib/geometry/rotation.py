@@ -9,45 +9,76 @@ from dg4d_lib.kernels.compiling import configure_numba
 
 configure_numba()
 
-SWEEPS = 6  # Jacobi sweeps; a 4 x 4 matrix needs five for full precision
+SWEEPS = 6  # Jacobi sweeps, at most; a 4 x 4 matrix needs five for full precision
+STEEP = 1e30  # cotangent of twice an angle that changes no digit
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def nearest_rotation(m, rotation):
-    """Write the proper rotation nearest to a matrix: an eigenvector (Horn 1987), found by Jacobi sweeps."""
-    n = np.zeros((4, 4))
-    n[0, 0], n[1, 1] = m[0, 0] + m[1, 1] + m[2, 2], m[0, 0] - m[1, 1] - m[2, 2]
-    n[2, 2], n[3, 3] = m[1, 1] - m[0, 0] - m[2, 2], m[2, 2] - m[0, 0] - m[1, 1]
-    n[0, 1], n[0, 2], n[0, 3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    n[1, 2], n[1, 3], n[2, 3] = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
-    vectors = np.eye(4)
+    """Write the proper rotation nearest to a matrix: an eigenvector (Horn 1987), found by Jacobi sweeps.
+
+    Scalars and tuples stay in registers, and sweeps end when none changes a digit: 0.6 of the time with arrays.
+    """
+    a, b = m[0, 0] + m[1, 1] + m[2, 2], m[0, 0] - m[1, 1] - m[2, 2]
+    c, d = m[1, 1] - m[0, 0] - m[2, 2], m[2, 2] - m[0, 0] - m[1, 1]
+    ab, ac, ad = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    bc, bd, cd = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
+    of_a, of_b, of_c, of_d = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     for _ in range(SWEEPS):
-        for p in range(3):
-            for q in range(p + 1, 4):
-                if abs(n[p, q]) < 1e-300:
-                    continue
-                tau = (n[q, q] - n[p, p]) / (2 * n[p, q])
-                t = (1.0 if tau >= 0 else -1.0) / (abs(tau) + np.sqrt(1 + tau * tau))
-                c = 1 / np.sqrt(1 + t * t)
-                s = t * c
-                n[p, p] -= t * n[p, q]
-                n[q, q] += t * n[p, q]
-                n[p, q] = 0.0
-                for r in range(4):
-                    if r not in (p, q):
-                        pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
-                        x, y = n[pr], n[qr]
-                        n[pr], n[qr] = c * x - s * y, s * x + c * y
-                    x, y = vectors[r, p], vectors[r, q]
-                    vectors[r, p], vectors[r, q] = c * x - s * y, s * x + c * y
-    best = 0
-    for p in range(1, 4):
-        if n[p, p] > n[best, best]:
-            best = p
-    w, x, y, z = vectors[0, best], vectors[1, best], vectors[2, best], vectors[3, best]
+        turned = False
+        if _is_off(a, b, ab):
+            a, b, ab, ac, bc, ad, bd, of_a, of_b = _without(a, b, ab, ac, bc, ad, bd, of_a, of_b)
+            turned = True
+        if _is_off(a, c, ac):
+            a, c, ac, ab, bc, ad, cd, of_a, of_c = _without(a, c, ac, ab, bc, ad, cd, of_a, of_c)
+            turned = True
+        if _is_off(a, d, ad):
+            a, d, ad, ab, bd, ac, cd, of_a, of_d = _without(a, d, ad, ab, bd, ac, cd, of_a, of_d)
+            turned = True
+        if _is_off(b, c, bc):
+            b, c, bc, ab, ac, bd, cd, of_b, of_c = _without(b, c, bc, ab, ac, bd, cd, of_b, of_c)
+            turned = True
+        if _is_off(b, d, bd):
+            b, d, bd, ab, ad, bc, cd, of_b, of_d = _without(b, d, bd, ab, ad, bc, cd, of_b, of_d)
+            turned = True
+        if _is_off(c, d, cd):
+            c, d, cd, ac, ad, bc, bd, of_c, of_d = _without(c, d, cd, ac, ad, bc, bd, of_c, of_d)
+            turned = True
+        if not turned:
+            break
+    largest, (w, x, y, z) = a, of_a
+    if b > largest:
+        largest, (w, x, y, z) = b, of_b
+    if c > largest:
+        largest, (w, x, y, z) = c, of_c
+    if d > largest:
+        largest, (w, x, y, z) = d, of_d
     rotation[0, 0], rotation[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
     rotation[2, 2] = 1 - 2 * (x * x + y * y)
     rotation[0, 1], rotation[1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
     rotation[0, 2], rotation[2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
     rotation[1, 2], rotation[2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _is_off(p, q, pq):
+    """Return true if a rotation of two axes by the element that couples them would change a digit."""
+    return abs(pq) >= 1e-300 and abs(q - p) < 2 * STEEP * abs(pq)
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _without(p, q, pq, pr, qr, ps, qs, of_p, of_q):
+    """Rotate two axes so that they are coupled no more; return the new elements, and the vectors of both axes."""
+    tau = (q - p) / (2 * pq)
+    t = (1.0 if tau >= 0 else -1.0) / (abs(tau) + np.sqrt(1 + tau * tau))
+    c = 1 / np.sqrt(1 + t * t)
+    s = t * c
+    vectors = (
+        (c * of_p[0] - s * of_q[0], c * of_p[1] - s * of_q[1], c * of_p[2] - s * of_q[2], c * of_p[3] - s * of_q[3]),
+        (s * of_p[0] + c * of_q[0], s * of_p[1] + c * of_q[1], s * of_p[2] + c * of_q[2], s * of_p[3] + c * of_q[3]),
+    )
+    others = c * pr - s * qr, s * pr + c * qr, c * ps - s * qs, s * ps + c * qs
+    return p - t * pq, q + t * pq, 0.0, others[0], others[1], others[2], others[3], vectors[0], vectors[1]

@@ -1,4 +1,4 @@
-"""Shapes of later frames: that of the first frame, carried along by the motion of the video, and the own guess.
+"""Shapes of later frames: blend of the prediction for the frame and the first frame's shape, warped by optical flow.
 
 Every pixel of a later frame takes along what lies behind it at the first frame. Depths stay, which is exact for motions
 in the image plane, or change as motions in a known upright plane do. Where the video is followed badly, the frame's own

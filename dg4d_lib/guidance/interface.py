@@ -33,10 +33,10 @@ def check_views(views: Sequence[GuidanceView], frames: int) -> None:
         BadInput: no views, views of different sizes, or a frame that is not there.
     """
     if not views:
-        raise BadInput("the prior was asked for no view at all; ask for at least one")
+        raise BadInput("no views were requested from the prior; request at least one")
     sizes = sorted({(view.camera.height, view.camera.width) for view in views})
     if len(sizes) > 1:
-        raise BadInput(f"views of one drawing must have one size; given {sizes}")
+        raise BadInput(f"views of one call must have one size; given {sizes}")
     for view in views:
         check_frame(view.frame, frames)
 
@@ -44,7 +44,7 @@ def check_views(views: Sequence[GuidanceView], frames: int) -> None:
 def check_frame(frame: int, frames: int) -> None:
     """Refuse a frame that is not there."""
     if not 0 <= frame < frames:
-        raise BadInput(f"frame {frame} was asked for; there are {frames}, counted from 0")
+        raise BadInput(f"frame {frame} was requested; there are {frames}, counted from 0")
 
 
 @runtime_checkable

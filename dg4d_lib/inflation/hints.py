@@ -23,9 +23,10 @@ FARTHEST = 1.0  # world units: the middle leaves z = 0 by no more
 FADE = 0.1  # world units beside known pixels: within it a hint loses most of its weight
 RIM = 3.0  # pixels: parts farther than this from the inside of the subject are all rim
 INVERSE_SIGMA, DISTANCE_SIGMA = 0.1, 0.03  # world units: error of the surface by relative and by metric depth
-LAYER = 0.15  # world units between mid-gray and white; on made-up shapes 0.1 to 0.2 score the same
+LAYER = 0.15  # world units between mid-gray and white; on synthetic shapes 0.1 to 0.2 score the same
 LOW, HIGH = 0.02, 0.98  # quantiles that stand for least and greatest: depth pictures have outliers
 DEPTH_SHARE = 0.5  # of the smaller extent of the subject: range of the depths that a picture shows of it
+LEAST_COVERAGE = 0.1  # of a pixel by values, of which it holds the average
 LEAST_KNOWN = 0.25  # of the subject's pixels that a depth picture must show
 FLAT = 1e-4  # range of depths, relative to the median, that says nothing
 GRAY_STEP = 2 / 255  # difference of gray levels that counts
@@ -56,14 +57,14 @@ class DepthHint:
     Attributes:
         turn_deg: how far its plane is turned about the vertical; positive brings the right side of the picture nearer
             to the camera. Between -60 and 60; None: not known.
-        field: depth of the first frame, which goes before the plane.
+        field: depth of the first frame, which takes precedence over the plane.
     """
 
     turn_deg: float | None = None
     field: DepthField | None = None
 
     @property
-    def says_nothing(self) -> bool:
+    def is_empty(self) -> bool:
         """True if nothing is known."""
         return self.turn_deg is None and self.field is None
 
@@ -105,7 +106,7 @@ def turned_plane(size: int, turn_deg: float) -> Float64[np.ndarray, "{size} {siz
 
 def depth_field(
     values: Float[Tensor, "s s"],
-    known: Bool[Tensor, "s s"],
+    coverage: Float[Tensor, "s s"],
     alpha: Float[Tensor, "s s"],
     kind: DepthKind,
     enlargement: float = 1.0,
@@ -118,7 +119,7 @@ def depth_field(
 
     Args:
         values: inverse depth (greater is nearer) up to scale and offset, or distance in any unit.
-        known: pixels with a value.
+        coverage: share of every pixel that has a value, in [0, 1]; `values` are averages over these shares.
         alpha: of the subject.
         kind: of the values.
         enlargement: size of the subject in the square, relative to the whole picture.
@@ -127,11 +128,12 @@ def depth_field(
         BadInput: the picture shows little of the subject, or no depth.
     """
     mask = alpha.numpy() > 0.5
-    sure = _without_rim(mask) & known.numpy()
-    if sure.sum() < LEAST_KNOWN * mask.sum() or not sure.any():
+    sure = _without_rim(mask) & is_known(coverage).numpy()
+    share = known_share(coverage, alpha)
+    if share < LEAST_KNOWN or not sure.any():
         raise BadInput(
-            f"the depth picture has values for {sure.sum() / max(1, mask.sum()):.0%} of the subject, at least "
-            f"{LEAST_KNOWN:.0%} are needed; NaN, infinity and distances of 0 or less count as unknown"
+            f"the depth picture has values for {share:.0%} of the subject, at least {LEAST_KNOWN:.0%} are needed; NaN, "
+            "infinity and distances of 0 or less count as unknown"
         )
     found = values.double().numpy()
     low, middle, high = np.quantile(found[sure], (LOW, 0.5, HIGH))
@@ -154,8 +156,19 @@ def depth_field(
     return DepthField(torch.from_numpy(np.where(sure, body, 0)).float(), torch.from_numpy(sure), sigma)
 
 
+def is_known(coverage: Float[Tensor, "s s"]) -> Bool[Tensor, "s s"]:
+    """Mark the pixels with enough values for an average; of sparse depth, few pixels are covered by half."""
+    return coverage > LEAST_COVERAGE
+
+
+def known_share(coverage: Float[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> float:
+    """Return the share of the subject that a depth picture has values for, in [0, 1]; 0 without a subject."""
+    mask = alpha > 0.5
+    return float(coverage[mask].mean()) if mask.any() else 0.0
+
+
 def layer_field(levels: Float[Tensor, "s s"], known: Bool[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> DepthField:
-    """Return the field of a picture of layers: mid-gray lies in the subject's plane, lighter before, darker behind it.
+    """Return the field of a picture of layers: mid-gray lies in the subject's plane, lighter is nearer.
 
     Args:
         levels: gray in [0, 1].
@@ -173,8 +186,8 @@ def layer_field(levels: Float[Tensor, "s s"], known: Bool[Tensor, "s s"], alpha:
     same = float(painted.max() - painted.min()) < GRAY_STEP
     if same and (bool((shown == mask).all()) or abs(float(painted.mean()) - 0.5) < GRAY_STEP):
         raise BadInput(
-            f"the layers have one level all over the subject, {round(255 * float(painted.mean()))} of 255, and say "
-            "nothing; paint what lies before the rest lighter than mid-gray (128), what lies behind it darker"
+            f"the layers have one level all over the subject, {round(255 * float(painted.mean()))} of 255, and carry "
+            "no depth; paint nearer parts lighter than mid-gray (128), farther parts darker"
         )
     return DepthField(torch.where(shown, 2 * LAYER * (levels - 0.5), 0.0), shown)
 

@@ -1,11 +1,14 @@
 """Numba's on-disk cache, keyed by all source files of a kernel, and a log line before the first compilation.
 
 Numba caches machine code on disk and recompiles a kernel when its file changes. Our kernels also inline functions and
-constants from files beside them and from this package, so their cache key includes a digest of both folders.
+constants from modules that they import, so their cache key includes a digest of these, and of those that they import
+in turn if they have kernels themselves.
 """
 
 import hashlib
 import logging
+import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,9 @@ from numba.core.registry import cpu_target
 
 NOTICE = "compiling CPU kernels (about ten seconds, only the first time)"
 
-_HERE = Path(__file__).parent
+_ROOT = Path(__file__).parents[2]  # that holds our packages
+_IMPORT = re.compile(r"^(?:from|import) ([\w.]+)(?: import (\([^)]*\)|.*))?", re.MULTILINE)
+_KERNELS = ("njit", "KERNEL", "INLINE")  # in the source of a module with functions that kernels call
 _log = logging.getLogger(__name__)
 
 
@@ -59,10 +64,8 @@ class _SourceDigest:
     def get_source_stamp(self) -> Any:
         """Return the key that cached machine code must match."""
         own = super().get_source_stamp()  # type: ignore[misc]
-        source = Path(self._py_file)
-        if f"{__package__}.simd" not in source.read_text(encoding="utf-8"):
-            return own  # a kernel without our helpers keeps Numba's stamp, whether this module is imported or not
-        return own, _digest(source.parent), _digest(_HERE)
+        inlined = _digest(Path(self._py_file))
+        return (own, inlined) if inlined else own  # others' kernels keep Numba's stamp, with this module or without
 
 
 class _EnvironmentCache(_SourceDigest, UserProvidedCacheLocator):
@@ -78,8 +81,26 @@ class _UserCache(_SourceDigest, UserWideCacheLocator):
 
 
 @cache
-def _digest(folder: Path) -> bytes:
-    content = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
-        content.update(path.name.encode() + b"\0" + path.read_bytes())
-    return content.digest()
+def _digest(kernel: Path) -> bytes:
+    """Return a digest of the modules whose functions and constants a kernel may inline, empty if there are none."""
+    content, found, queue = hashlib.sha256(), set[Path](), [kernel]
+    while queue:
+        for path in _imported(queue.pop()):
+            if path not in found:
+                found.add(path)
+                if any(word in path.read_text(encoding="utf-8") for word in _KERNELS):
+                    queue.append(path)
+    for path in sorted(found):
+        content.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return content.digest() if found else b""
+
+
+def _imported(source: Path) -> Iterator[Path]:
+    """Yield the files of the modules of our packages that a file imports."""
+    own = source.relative_to(_ROOT).parts[0] if source.is_relative_to(_ROOT) else ""
+    for module, names in _IMPORT.findall(source.read_text(encoding="utf-8")):
+        if module.split(".")[0] in (own, __name__.split(".")[0]):
+            for name in ["", *re.findall(r"\w+", names)]:
+                path = _ROOT.joinpath(*module.split("."), name).with_suffix(".py")
+                if path.is_file():
+                    yield path

@@ -25,7 +25,7 @@ LARGE = 64  # mean sizes of a face: larger ones, such as a ground plane, are com
 
 @dataclass(frozen=True)
 class SurfaceDefects:
-    """Counts of the defects of a surface at one moment.
+    """Counts of the defects of a surface in one frame.
 
     Attributes:
         faces: number of faces.

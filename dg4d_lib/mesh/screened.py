@@ -1,4 +1,4 @@
-"""Screened Laplace systems of a mesh, solved from a good start: positions that are pulled and hold together."""
+"""Screened Laplace systems on a mesh, solved iteratively from an initial guess."""
 
 from typing import no_type_check
 

@@ -39,7 +39,7 @@ def load_i3d(path: Path, device: torch.device) -> Any:
             )  # TorchScript is deprecated, but I3D is published in no other format
             return torch.jit.load(str(file), map_location=device).eval()
     except (RuntimeError, ValueError, OSError) as error:
-        raise BadInput(f"{file} is no TorchScript file: {error}".splitlines()[0]) from error
+        raise BadInput(f"{file} is not a TorchScript file: {error}".splitlines()[0]) from error
 
 
 def logits(i3d: Any, video: Float[Tensor, "t h w 3"], device: torch.device) -> Float[Tensor, " d"]:

@@ -148,5 +148,5 @@ def infer_unet_config(tensors: Mapping[str, Tensor]) -> UnetConfig:
         channels[way] = tuple(len(tensors[f"{level}.nets.0.conv1.weight"]) for level in levels)
         attention[way] = tuple(f"{level}.attns.0.norm.weight" in tensors for level in levels)
     if not 1 <= len(channels["up"]) < len(channels["down"]):
-        raise BadInput(f"these are no weights of LGM: found levels down {channels['down']}, up {channels['up']}")
+        raise BadInput(f"these are not weights of LGM: found levels down {channels['down']}, up {channels['up']}")
     return UnetConfig(channels["down"], attention["down"], channels["up"], attention["up"])

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-INDEPENDENCE = 0.15  # share of the cells of a ray that err independently; on made-up shapes 0.1 to 0.2 score the same
+INDEPENDENCE = 0.15  # share of the cells of a ray that err independently; on synthetic shapes 0.1 to 0.2 score the same
 OPAQUE = 1.75  # optical depth of the subject seen from the input camera, at least
 LARGEST = 0.995  # probability
 

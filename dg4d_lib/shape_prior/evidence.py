@@ -32,7 +32,7 @@ def hint_evidence(
         logits: of every cell lying inside the subject, by the network alone.
         mask: pixels of the subject.
     """
-    if hint.says_nothing or not mask.any():
+    if hint.is_empty or not mask.any():
         return torch.zeros_like(logits)
     middle, weight = hint.middle(SIZE)
     inside = mask.numpy()
@@ -55,9 +55,10 @@ def middle_evidence(
 def front_evidence(
     front: Float64[np.ndarray, "s s"], thickness: Float64[np.ndarray, "s s"], sigma: float
 ) -> Float64[np.ndarray, "s s d"]:
-    """Return log-odds of matter on rays whose first surface is known.
+    """Return occupancy log-odds on rays whose first surface is known.
 
-    Nothing lies before it. Behind it lies matter, the less surely the deeper, down to the expected thickness.
+    The space in front of it is free. Cells behind it are occupied, with less certainty the deeper, down to the expected
+    thickness.
 
     Args:
         front: depth of the surface, world units along +z.

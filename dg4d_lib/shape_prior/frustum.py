@@ -20,7 +20,7 @@ TAN_HALF_FOV = math.tan(math.radians(FOV_Y_DEG) / 2)
 def grid_places(
     right: Float[Tensor, " n"], down: Float[Tensor, " n"], distance: Float[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
-    """Return where `grid_sample` finds points before the camera: depth, column and row, in [-1, 1] on the grid.
+    """Return the `grid_sample` coordinates of points in front of the camera: depth, column and row, in [-1, 1].
 
     Args:
         right: of the line of sight, world units.

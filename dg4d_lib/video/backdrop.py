@@ -1,4 +1,4 @@
-"""Segmentation before a plain backdrop: a smooth color model for all frames, and a flood fill from the border.
+"""Segmentation in front of a plain backdrop: a smooth color model for all frames, and a flood fill from the border.
 
 The backdrop's color is a low-degree polynomial in x and y, fitted robustly to the border, so gradients and vignettes
 count as plain and the subject may touch the border. Pixels that the flood fill reaches are backdrop, including soft
@@ -167,7 +167,7 @@ def _sample(
 
 def _monomials(rows: ndarray, columns: ndarray, height: int, width: int, degree: int) -> Float[ndarray, "p k"]:
     """Evaluate the monomials 1, x, y, x^2, xy, y^2, ... at pixels, lower degrees first; x and y in [-1, 1]."""
-    x, y = 2 * columns / (width - 1) - 1, 2 * rows / (height - 1) - 1
+    x, y = (2 * places / max(1, side - 1) - 1 for places, side in ((columns, width), (rows, height)))
     return np.stack([x**i * y**j for i, j in _exponents(degree)], 1)
 
 

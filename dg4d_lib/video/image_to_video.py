@@ -48,7 +48,7 @@ class ImageToVideo:
         """Store the settings and a loaded pipeline, and check that it takes a picture.
 
         Raises:
-            BadInput: it is no image-to-video pipeline, or takes no last picture although a loop is asked for.
+            BadInput: it is not an image-to-video pipeline, or takes no last picture although a loop is asked for.
         """
         self.settings, self.pipeline, self.offload, self._model = settings, pipeline, offload, model
         self.notes: tuple[str, ...] = ()
@@ -122,8 +122,8 @@ class ImageToVideo:
             )
         if frames.shape[1:3] != (picture.height, picture.width):
             raise BadInput(
-                f"{type(self.pipeline).__name__} made {frames.shape[2]} x {frames.shape[1]} pixels of a picture of "
-                f"{picture.width} x {picture.height}; set driving.width and driving.height to a size that it makes"
+                f"{type(self.pipeline).__name__} generated {frames.shape[2]} x {frames.shape[1]} pixels from a picture "
+                f"of {picture.width} x {picture.height}; set driving.width and driving.height to a supported size"
             )
         return frames.clamp(0, 1)[kept_frames(len(frames), settings.frames, settings.loop)]
 
@@ -156,7 +156,7 @@ def check_image_to_video(pipeline: Any, model: Path, loop: bool) -> None:
     required = {key for key, one in parameters.items() if one.default is one.empty and one.kind is not one.VAR_KEYWORD}
     frames = {"num_frames", *OWN_NAMES["num_frames"]} & set(parameters)
     if "image" not in parameters or not frames or required - {"image", "prompt"}:
-        raise BadInput(f"{name} in {model} is no image-to-video pipeline; choose one that is")
+        raise BadInput(f"{name} in {model} is not an image-to-video pipeline; choose one that is")
     if loop and "last_image" not in parameters:
         raise BadInput(
             f"driving.loop=true needs a first-last-frame model, and {name} in {model} takes no last picture; use "

@@ -26,7 +26,7 @@ from dg4d_lib.video.still_pixels import average_still_pixels
 Method = Literal["backdrop", "uneven backdrop", "network"]
 NetworkLoader = Callable[[], Segmentation]
 
-BACKDROP_SIDE = 640  # longest side for the segmentation before plain backdrops, pixels
+BACKDROP_SIDE = 640  # longest side for the segmentation in front of plain backdrops, pixels
 REFINED_SIDE = 512  # longest side for color models and for the coefficients of the guided filter, pixels
 MIN_AREA = 0.005  # minimum share of the first frame that the subject covers
 MAX_AREA = 0.95  # maximum share of the first frame that the subject covers
@@ -53,7 +53,7 @@ KEPT = 0.8  # weight of the previous frame's alpha at static pixels
 STILL = 0.04  # change of color, in [0, 1], below which a pixel counts as static between two frames
 ADVICE = (
     "give a PNG with a transparent background, a mask (--mask FILE), the part of the picture that shows the subject "
-    "(--box X,Y,W,H), or a picture of one subject before a plain backdrop"
+    "(--box X,Y,W,H), or a picture of one subject in front of a plain backdrop"
 )
 
 

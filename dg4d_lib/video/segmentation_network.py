@@ -87,7 +87,7 @@ def load_network(content: bytes, what: str, preprocessing: Preprocessing = Prepr
 
     Raises:
         BackendUnavailable: onnxruntime is not installed.
-        BadInput: the file is no ONNX model, or does not map one picture to one map.
+        BadInput: the file is not an ONNX model, or does not map one picture to one map.
     """
     try:
         import onnxruntime  # noqa: PLC0415 - takes a fifth of a second, and plain backdrops need no network
@@ -100,12 +100,14 @@ def load_network(content: bytes, what: str, preprocessing: Preprocessing = Prepr
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class of its own for every status
-        raise BadInput(f"{what} is no ONNX model that can be read ({type(error).__name__}); pull it again") from error
+        raise BadInput(
+            f"{what} is not an ONNX model that can be read ({type(error).__name__}); pull it again"
+        ) from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape: list[Any] = inputs[0].shape if len(inputs) == 1 else []
     if len(shape) != 4 or shape[1] not in (3, "channels", None) or not outputs or inputs[0].type != "tensor(float)":
         raise BadInput(
-            f"{what} is no segmentation network: expected one input of form [1, 3, height, width] in float32, found "
+            f"{what} is not a segmentation network: expected one input of form [1, 3, height, width] in float32, found "
             f"{[(one.name, one.type, one.shape) for one in inputs]}"
         )
     side = shape[2] if isinstance(shape[2], int) else preprocessing.side or DEFAULT_SIDE

@@ -42,7 +42,7 @@ def unmix(picture: Float[Tensor, "h w 3"], mask: Bool[ndarray, "h w"], band: int
     between these two colors, and the foreground color is the pixel without the background's part.
 
     Args:
-        picture: before a backdrop that is smooth near the outline.
+        picture: in front of a backdrop that is smooth near the outline.
         mask: of the subject.
         band: half of the width of the band, pixels.
     """

@@ -25,7 +25,7 @@ class StableVideo:
         self.settings, self.model = settings, model
         self.notes: tuple[str, ...] = ()
         if settings.frames != model.num_frames:
-            self.notes = (f"The video model was trained on {model.num_frames} frames and made {settings.frames}.",)
+            self.notes = (f"The video model was trained on {model.num_frames} frames and generated {settings.frames}.",)
 
     def generate_all(
         self, subject: Float[Tensor, "h w 4"], generators: Sequence[torch.Generator]

@@ -22,7 +22,7 @@ from dg4d_lib.visual_hull.known import KnownView, places_before
 NEARLY = 0.3  # log-odds by which a cell that stays may be less probable than the best one behind its pixel
 SMOOTH = 1.0  # cells: standard deviation of the filter over log-odds
 
-# Log-odds of matter at every row, column and depth (`dg4d_lib.shape_prior.frustum`) before the camera of a cut-out.
+# Occupancy log-odds at every row, column and depth (`dg4d_lib.shape_prior.frustum`) in front of a cut-out's camera.
 Predict = Callable[[Float[Tensor, "h w 4"]], Float[Tensor, "128 128 64"]]
 
 
@@ -31,7 +31,7 @@ def probable(volume: Volume, views: Sequence[KnownView], predict: Predict) -> Vo
 
     Args:
         volume: hull of the views.
-        views: of one moment; their weights count.
+        views: of one frame; their weights count.
         predict: tells the shape behind each of their pictures.
     """
     values = torch.from_numpy(volume.values)
@@ -56,7 +56,7 @@ def probable(volume: Volume, views: Sequence[KnownView], predict: Predict) -> Vo
 def _seen(
     points: Float[Tensor, "n 3"], view: KnownView, logits: Float[Tensor, "128 128 64"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
-    """Return the log-odds of points before the camera of a view, and the pixels (row by row) that show them."""
+    """Return the log-odds of points in front of the camera of a view, and the pixels (row by row) that show them."""
     at = places_before(view.camera, points)
     found = grid_sample(logits[None, None], at[None, None, None], align_corners=False, padding_mode="border")[
         0, 0, 0, 0

@@ -48,15 +48,15 @@ def meeting_point(poses: Float[Tensor, "k 3 4"]) -> Float[Tensor, " 3"]:
     volumes = torch.linalg.det(poses[:, :, :3]) / lengths.prod(-1).clamp(min=SMALLEST)
     if bad := [i for i, volume in enumerate(volumes.tolist()) if volume < LEAST_RIGHT]:
         raise BadInput(
-            f"transform_matrix of frame {bad[0]} (counted from 0) is no rotation and place: its first three columns "
-            "must be perpendicular axes, right, up and backward"
+            f"transform_matrix of frame {bad[0]} (counted from 0) is not a rotation and translation: its first three "
+            "columns must be perpendicular axes, right, up and backward"
         )
     places, forward = poses[:, :, 3], -poses[:, :, 2] / lengths[:, 2:]
     projectors = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None]
     normal = projectors.sum(0)
     if float(torch.linalg.svdvals(normal)[-1]) < LEAST_SPREAD * len(poses):
         raise BadInput(
-            "the cameras look in one direction, so the subject's place is unknown; give cameras around the subject"
+            "the cameras look in one direction, so the subject's position is unknown; give cameras around the subject"
         )
     point = torch.linalg.solve(normal, (projectors @ places[:, :, None]).sum(0)[:, 0])
     offsets = point - places

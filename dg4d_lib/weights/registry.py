@@ -98,7 +98,9 @@ SVD_SHARED = {
     "image_encoder/model.fp16.safetensors": "ae616c24393dd1854372b0639e5541666f7521cbe219669255e865cb7f89466a",
 }  # the same files in the variants for 14 and for 25 frames
 APACHE_CARD = License(
-    "Apache-2.0", "yes", "commercial use is allowed; so say those who quote its card, read it before you sell"
+    "Apache-2.0",
+    "yes",
+    "commercial use is allowed according to quotations of its card; read the card before commercial use",
 )
 WAN_PARTS = ("vae", "text_encoder", "tokenizer", "transformer", "scheduler", "model_index.json")
 OPEN_MODELS = (

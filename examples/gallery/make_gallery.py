@@ -169,7 +169,8 @@ def _section(entry: Entry, result: Result) -> str:
     )
     return (
         f"\n## {entry.title}\n\n"
-        f"![Input: {entry.name}](gallery/{entry.picture}) ![Film: {entry.name}](gallery/{entry.name}_film.webp)\n\n"
+        f"![Input: {entry.name}](gallery/{entry.picture}) "
+        f"![Animation: {entry.name}](gallery/{entry.name}_film.webp)\n\n"
         f"```\n{entry.command}\n```\n\n"
         f"{result.seconds:.0f} s; {gates}.\n"
     )

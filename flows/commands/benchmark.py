@@ -295,7 +295,7 @@ def _unpack_films(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, d
             folder = out / FILMS / name / whose
             folder.mkdir(parents=True, exist_ok=True)
             with room_for(folder):
-                films = unpack(home.store().path(ref), folder, "the zip of films")
+                films = unpack(home.store().path(ref), folder, "the zip of videos")
             views = {Path(film).stem: f"{FILMS}/{name}/{whose}/{film}" for film in films}
             shown.setdefault(name, {})[whose] = views
     return shown

@@ -93,11 +93,21 @@ def rebuild(
     source: Annotated[
         Path | None, typer.Option(metavar="PATH", help="source file, if the store no longer has it")
     ] = None,
-    bank: Annotated[Path | None, typer.Option(metavar="DIR", help="ground-truth views, likewise")] = None,
-    mask: Annotated[Path | None, typer.Option(metavar="PATH", help="mask of the subject, likewise")] = None,
-    depth: Annotated[Path | None, typer.Option(metavar="FILE", help="depth picture, likewise")] = None,
-    layers: Annotated[Path | None, typer.Option(metavar="FILE", help="picture of layers, likewise")] = None,
-    asset: Annotated[Path | None, typer.Option(metavar="FILE", help="the user's own model, likewise")] = None,
+    bank: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="ground-truth views, if the store no longer has them")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="mask of the subject, if the store no longer has it")
+    ] = None,
+    depth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="depth picture, if the store no longer has it")
+    ] = None,
+    layers: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="picture of layers, if the store no longer has it")
+    ] = None,
+    asset: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="the user's own model, if the store no longer has it")
+    ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="keep the new package in DIR")] = None,
     as_json: AsJson = False,
 ) -> None:

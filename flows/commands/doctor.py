@@ -63,7 +63,7 @@ def _print(out: "Console", profile: str, machine: "Machine", found: dict[str, "R
     if chosen.command:
         out.print(f"  {chosen.command}", markup=False, soft_wrap=True)
     if chosen.weights and machine.gpu_problem:
-        out.print("  Without a GPU its networks run on the processor, for days.", markup=False)
+        out.print("  Without a GPU its networks run on the CPU, which takes days.", markup=False)
 
 
 def _machine_table(machine: "Machine") -> "Table":

@@ -113,16 +113,16 @@ def describe(error: Exception) -> tuple[str, int]:
     """Return the message and the exit status of an error; save the traceback of an unexpected one."""
     from dg4d_lib.errors import BackendUnavailable, BadInput, FitDiverged
     from flows.serving.server import ServerUnavailable
-    from flows.step_errors import StepBadInput, StepDiverged, StepError, StepMissing
+    from flows.step_errors import StepDiverged, StepError
     from steps.store.artifact_store import ArtifactMissing
 
     text = error.message if isinstance(error, StepError) else str(error)
     match error:
-        case BadInput() | FitDiverged() | StepBadInput():
+        case BadInput() | FitDiverged():
             return text, EXIT_BAD_INPUT
         case StepDiverged():
             return str(error), EXIT_BAD_INPUT
-        case BackendUnavailable() | StepMissing() | ServerUnavailable() | ArtifactMissing():
+        case BackendUnavailable() | ServerUnavailable() | ArtifactMissing():
             return text, EXIT_MISSING
         case StepError():
             return str(error), EXIT_FAILED

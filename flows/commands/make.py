@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Wish:
+class MakeArguments:
     """Arguments of `dg4d make` that concern the sources and the output.
 
     Attributes:
@@ -32,7 +32,7 @@ class Wish:
         asset: the user's own model.
         alone: an option of the command line that makes one asset; empty if none is given.
         out: output folder; of several pictures the folder above those of the assets.
-        force: replace an asset of another name in the output folder.
+        force: replace an asset with a different name in the output folder.
         picked: true if `--pick` chooses a motion.
         request: returns the checked request of an item with its picture.
     """
@@ -48,7 +48,7 @@ class Wish:
     request: Callable[[str, Path | None], ConversionRequest]
 
 
-def make_each(wish: Wish, console: "Console") -> int:
+def make_each(arguments: MakeArguments, console: "Console") -> int:
     """Make an asset of every picture; return the exit status.
 
     One picture that fails raises its error; of several, the others are made nevertheless.
@@ -57,39 +57,43 @@ def make_each(wish: Wish, console: "Console") -> int:
         BadInput: arguments cannot be combined, or the only picture cannot be used.
         StepError: a step of the only picture failed.
     """
-    if len(wish.pictures) < 2:
-        picture = wish.pictures[0] if wish.pictures else None
-        named = picture or wish.asset or wish.video
-        item = name_from_path(named) if named else name_from_text(wish.text)
-        _make(wish, item, picture, wish.out or Path("out") / item, console)
+    if len(arguments.pictures) < 2:
+        picture = arguments.pictures[0] if arguments.pictures else None
+        named = picture or arguments.asset or arguments.video
+        item = name_from_path(named) if named else name_from_text(arguments.text)
+        _make(arguments, item, picture, arguments.out or Path("out") / item, console)
         return 0
-    if wish.alone:
-        raise BadInput(f"{wish.alone} makes one asset, and {len(wish.pictures)} pictures are given; give one of them")
-    items = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in wish.pictures])
+    if arguments.alone:
+        raise BadInput(
+            f"{arguments.alone} makes one asset, and {len(arguments.pictures)} pictures are given; give one of them"
+        )
+    items = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in arguments.pictures])
     failed: dict[str, str] = {}  # kind of failure by item
-    for number, (item, picture) in enumerate(zip(items, wish.pictures, strict=True), 1):
+    for number, (item, picture) in enumerate(zip(items, arguments.pictures, strict=True), 1):
         console.print(f"{number} of {len(items)}: {picture}", markup=False)
         try:
-            _make(wish, item, picture, (wish.out or Path("out")) / item, console)
+            _make(arguments, item, picture, (arguments.out or Path("out")) / item, console)
         except Exception as error:  # must not stop the other pictures
             from flows.engine.item_runs import failure
 
             failed[item] = failure(error).kind
             console.print(f"failed: {item}: {describe(error)[0]}", markup=False, style="red")
-    console.print(f"{len(items) - len(failed)} of {len(items)} assets are in {wish.out or Path('out')}", markup=False)
+    console.print(
+        f"{len(items) - len(failed)} of {len(items)} assets are in {arguments.out or Path('out')}", markup=False
+    )
     if not failed:
         return 0
     return exit_status_of(failed.get(item, "") for item in items)
 
 
-def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
+def _make(arguments: MakeArguments, item: str, picture: Path | None, folder: Path, console: "Console") -> None:
     """Make one asset, and print its files and how to see it."""
-    request = wish.request(item, picture)
-    if wish.picked and request.has_motion:
+    request = arguments.request(item, picture)
+    if arguments.picked and request.has_motion:
         raise BadInput(f"--pick chooses a generated motion, and {request.source_name} is a video; leave --pick out")
     for sentence in (*request.unused(), *request.license_conditions()):
         console.print(f"note: {sentence}", markup=False)
-    check_folder(folder, item, wish.force)
+    check_folder(folder, item, arguments.force)
     with stored(request) as job:
         before = record_of(folder) or {}
         named = before.get("item", item)  # `--force` replaces the asset of another name
@@ -101,11 +105,13 @@ def _make(wish: Wish, item: str, picture: Path | None, folder: Path, console: "C
                     "earlier version); -o chooses another folder",
                     markup=False,
                 )
-            _, cached = terminal.run_with_progress(job, console, lambda: convert_job(job, folder, force=wish.force))
+            _, cached = terminal.run_with_progress(
+                job, console, lambda: convert_job(job, folder, force=arguments.force)
+            )
     if up_to_date:
         console.print("nothing to do: every step was already done")
     elif cached:
-        console.print("no step to do: the package was written from finished steps")
+        console.print("no step was run: the package was written from finished steps")
     written = (record_of(folder) or {"files": {}})["files"]
     terminal.print_package(console, folder, {name: fact["size_bytes"] for name, fact in written.items()})
     terminal.print_next(console, folder)

@@ -67,8 +67,8 @@ Views = Annotated[
     typer.Option(
         "--view",
         metavar="AZIMUTH[,ELEVATION]=FILE",
-        help="picture of another side at the first moment, degrees: 90 is the side that PICTURE shows on the right, "
-        "180 the back; may be repeated",
+        help="picture of another side in the first frame; azimuth in degrees: 90 is the side that PICTURE shows on the "
+        "right, 180 the back; may be repeated",
     ),
 ]
 Turntable = Annotated[
@@ -84,8 +84,8 @@ Cameras = Annotated[
     typer.Option(
         "--cameras",
         metavar="FILE",
-        help="transforms.json of nerfstudio with pictures of one moment, or synchronized videos; the camera "
-        "whose file is PICTURE (by path, or by a unique name) is the input camera; otherwise the first",
+        help="transforms.json of nerfstudio: pictures of the first frame, or synchronized videos. The input camera is "
+        "the one whose file is PICTURE (same path, or same unique name), else the first",
     ),
 ]
 Triangles = Annotated[
@@ -122,7 +122,7 @@ Depth = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="depth picture of the first frame, of its size: inverse depth (bright is near), or distances as EXR or "
+        help="depth picture of the first frame, same size: inverse depth (bright is near), or distances as EXR or "
         "TIFF with floating-point numbers",
     ),
 ]
@@ -130,8 +130,7 @@ Layers = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="gray picture of the first frame, of its size: parts lighter than mid-gray lie before the rest, darker "
-        "ones behind it",
+        help="gray picture of the first frame, same size: lighter than mid-gray is nearer, darker is farther",
     ),
 ]
 Box = Annotated[

@@ -209,4 +209,4 @@ def _environment_changes(
         here = {"code": now.code_version, "backend": now.backend, **now.weights, **now.machine}
         for what in sorted({*then, *here}):
             if then.get(what) != here.get(what):
-                yield f"{what}: {then.get(what, 'none')} then, {here.get(what, 'none')} now"
+                yield f"{what}: {then.get(what, 'none')} recorded, {here.get(what, 'none')} now"

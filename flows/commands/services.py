@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
 POLL_S = 1.0  # between two scans of a watched folder
 RESULTS_EVERY_S = 5.0  # between two looks for finished packages
-FORM = "then choose Deployments, Picture to 4D, Run"
-OPEN_OWN = f"open this address first: it signs the browser in to the Prefect UI; {FORM}"
-WATCH_STOPPED = "stopped watching; conversions that were sent go on until `dg4d down`"
-OPEN_OTHER = f"open this address, the Prefect UI of $PREFECT_API_URL; {FORM}"
+OPEN_OWN = "open this address first: it signs the browser in to the Prefect UI"
+WATCH_STOPPED = "stopped watching; conversions that were sent continue until `dg4d down`"
+OPEN_OTHER = "open this address, the Prefect UI of $PREFECT_API_URL; a server of dg4d signs the browser in at"
 
 
 def up(
@@ -50,10 +49,13 @@ def up(
     pools and deployments are registered on that server.
     """
     with exit_on_error():
-        server = _serve(pools, workers, sources)
+        from flows.serving.server import LOGIN
+
+        server, forms = _serve(pools, workers, sources)
         api_url = os.environ["PREFECT_API_URL"]
         address, is_own = api_url.removesuffix("/api"), server.is_at(api_url)
-        typer.echo(OPEN_OWN if is_own else OPEN_OTHER, err=True)
+        choose = f"; then choose Deployments, {forms[0].partition('/')[2]}, Run" if forms else ""
+        typer.echo((OPEN_OWN if is_own else f"{OPEN_OTHER} {LOGIN}#NAME:PASSWORD") + choose, err=True)
         typer.echo(server.login_address(address) if is_own else address)
         if is_own:
             typer.echo('other programs: eval "$(dg4d env)"; server and workers run until `dg4d down`', err=True)
@@ -88,7 +90,7 @@ def studio(
             )
         home.uploads().mkdir(mode=0o700, parents=True, exist_ok=True)
         home.make_private(home.studio().parent)
-        server = _serve(None, True, [str(home.uploads()), *(sources or ())], quiet=True)
+        server, _ = _serve(None, True, [str(home.uploads()), *(sources or ())], quiet=True)
         api_url = os.environ["PREFECT_API_URL"]
         address = server.login_address(api_url.removesuffix("/api"), STUDIO_ADDRESS)
         typer.echo("open this address: it signs the browser in; server and worker run until `dg4d down`", err=True)
@@ -99,7 +101,9 @@ def studio(
             open_page(address)
 
 
-def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, quiet: bool = False) -> "Server":
+def _serve(
+    pools: list[str] | None, workers: bool, sources: list[str] | None, quiet: bool = False
+) -> tuple["Server", list[str]]:
     """Start the server, register pools and deployments, and start workers; see `up`.
 
     Args:
@@ -108,8 +112,11 @@ def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, qu
         sources: folders that deployments may read; None or empty: the default.
         quiet: print no list, and leave a worker that runs with other sources as it is.
 
+    Returns:
+        The server, and the deployments with forms as FLOW/NAME.
+
     Raises:
-        BadInput: a pool is unknown, a source is no folder, or a worker runs with other sources.
+        BadInput: a pool is unknown, a source is not a folder, or a worker runs with other sources.
     """
     from dg4d_lib.errors import BadInput
     from dg4d_lib.rasterizer.backends import cuda_device_count
@@ -138,7 +145,7 @@ def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, qu
 
     forms = [name for name in register(known, chosen) if not name.startswith(f"{FLOW}/")]  # catalogs start the others
     if forms and not quiet:
-        typer.echo("deployments, forms that run from the Prefect UI:", err=True)
+        typer.echo("deployments with forms in the Prefect UI:", err=True)
         for name in forms:
             typer.echo(name)
     api_url = os.environ["PREFECT_API_URL"]
@@ -146,8 +153,8 @@ def _serve(pools: list[str] | None, workers: bool, sources: list[str] | None, qu
     for worker in own:
         worker.start(api_url, {**variables, **limits[worker.pool]})
         if not quiet:
-            typer.echo(f"{worker.pool} reads below {worker.sources}", err=True)
-    return server
+            typer.echo(f"worker {worker.pool} reads files below {worker.sources}", err=True)
+    return server, forms
 
 
 def down() -> None:
@@ -243,11 +250,13 @@ def watch(
                     except (httpx.TransportError, httpx.HTTPStatusError) as error:
                         if isinstance(error, httpx.HTTPStatusError) and not _is_passing(error.response.status_code):
                             raise
-                        trouble = "the server is unavailable; the files are announced when it answers"
+                        trouble = "the server is unavailable; the files are sent when it answers"
                         revive()
                     else:
                         watcher.told()
-                        typer.echo("files came to rest; sent to the server; packages are named here when they are done")
+                        typer.echo(
+                            f"no change for {rest_s:g} s: files sent to the server; finished packages are listed below"
+                        )
                     if trouble not in {"", before}:
                         typer.echo(trouble, err=True)
                 time.sleep(POLL_S)

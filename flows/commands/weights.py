@@ -64,7 +64,7 @@ def pull(
 ) -> None:
     """Download weights and record their revision and digests.
 
-    Sizes are shown first. Weights that are present are skipped, and a download that broke off goes on.
+    Sizes are shown first. Weights that are present are skipped, and an interrupted download resumes.
     """
     with exit_on_error():
         from dg4d_lib.weights.pull import download, plan_pull

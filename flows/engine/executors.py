@@ -42,6 +42,7 @@ from steps.contract import (
     StepResult,
     StepSpec,
 )
+from steps.runtime.failures import MEMORY_SETTINGS
 from steps.runtime.job import Progress
 from steps.runtime.messages import notes_to
 from steps.runtime.perform import perform
@@ -88,7 +89,7 @@ _ERRORS: dict[str, type[StepError]] = {  # by the kind of a `StepFailure`
     "crashed": StepCrashed,
 }
 KILLED = (  # SIGKILL without a failure report is nearly always the kernel's out-of-memory killer
-    "it was killed, most likely because memory ran out: end other programs, or choose smaller settings"
+    f"the step was killed, probably out of memory: end other programs, or lower {MEMORY_SETTINGS}"
 )
 
 
@@ -179,9 +180,9 @@ def _result_of(
     tail = _tail(folder / "stderr")
     kind = next((kind for kind, code in EXIT_STATUS.items() if code == status), "crashed")
     if kind != "crashed":
-        raise _ERRORS[kind](spec.name, tail or f"the process ended with status {status}")
-    reason = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
-    raise StepCrashed(spec.name, f"{reason} and no result" + (f": {tail}" if tail else ""))
+        raise _ERRORS[kind](spec.name, tail or f"the process exited with status {status}")
+    reason = f"killed by signal {-status}" if status < 0 else f"exited with status {status}"
+    raise StepCrashed(spec.name, f"{reason} without writing a result" + (f": {tail}" if tail else ""))
 
 
 EXECUTORS: dict[str, Execute] = {"subprocess": in_subprocess, "container": in_container, "in_process": in_process}

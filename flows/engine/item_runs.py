@@ -142,7 +142,9 @@ class ItemDeployment(NamedTuple):
             try:
                 run = client.read_flow_run(run.id)
                 if _is_stranded(client, run, self.pool):
-                    again: State[Any] = Scheduled(name="AwaitingRetry", message="its worker died before it began")
+                    again: State[Any] = Scheduled(
+                        name="AwaitingRetry", message="the worker stopped before the run began"
+                    )
                     client.set_flow_run_state(run.id, again, force=True)
             except (httpx.TransportError, PrefectHTTPStatusError):
                 continue  # the run goes on while the server is away
@@ -177,7 +179,7 @@ def failure(error: Exception) -> Outcome:
     """Return the outcome of an item that ended with an exception."""
     if isinstance(error, ItemFailed):
         return error.outcome
-    known = isinstance(error, StepError | DG4DError)
+    known = isinstance(error, DG4DError)
     return Outcome(
         kind=type(error).__name__ if known else "Crashed",
         message=error.message
@@ -228,11 +230,11 @@ def _is_at_work(run: FlowRun) -> bool:
 def _outcome_of(run: FlowRun, store: ArtifactStore) -> Outcome:
     """Return the outcome of an ended run, or one made from its state if it wrote none."""
     if run.state is not None and run.state.is_cancelled():
-        return Outcome(kind="Cancelled", message="its run was cancelled")
+        return Outcome(kind="Cancelled", message="the run was cancelled")
     outcome = read_outcome(store, str(run.id))
     if outcome is not None:
         return outcome
-    message = str(run.state.message or run.state.name) if run.state else "its run has no state"
+    message = str(run.state.message or run.state.name) if run.state else "the run has no state"
     return Outcome(kind="Crashed", message=message, may_heal=True)
 
 
@@ -258,7 +260,7 @@ def _has_package(run: FlowRun, store: ArtifactStore) -> bool:
 
 
 def _give_up(client: SyncPrefectClient, run: FlowRun) -> None:
-    """Cancel a scheduled run; a running one goes on, and the same catalog finds it again."""
+    """Cancel a scheduled run; leave a running one, which a restart of the catalog picks up."""
     if run.state is not None and run.state.is_scheduled():
         with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # a run that is not cancelled is found again
             client.set_flow_run_state(run.id, Cancelled(message="the catalog was stopped"))

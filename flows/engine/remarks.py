@@ -1,4 +1,4 @@
-"""Remarks on a cut-out that the user should read before the conversion goes on, and first looks at the splats."""
+"""Remarks on a cut-out that the user should read before the conversion continues, and previews of the static splats."""
 
 import os
 import re
@@ -18,13 +18,13 @@ from steps.store.files import DiskFull, room_for
 
 REMARKED = "prepare_subject"  # the cut-out may be wrong
 COMPARED = "prepare_views"  # a view may contradict the others
-DRAWN = "generate_views"  # likewise
+GENERATED = "generate_views"  # a view may contradict the others
 LOOKED_AT = "fit_gaussians"
 FIRST_LOOK = "first_look"  # its output: web splats
 CAPTIONS = {
     REMARKED: "Source, matte and cut-out",
-    COMPARED: "Views, and the hull that they share",
-    DRAWN: "Drawn views, and the hull that they share",
+    COMPARED: "Views and their visual hull",
+    GENERATED: "Generated views and their visual hull",
 }
 GATES = "cutout_gates"  # output of `prepare_subject` with the gates of an estimated cut-out
 NAME_LENGTH = 80  # characters of an item in the name of a picture
@@ -33,11 +33,11 @@ MOST_PICTURES, MOST_PAGES = 200, 20  # kept files, the newest; they show private
 
 
 def remark(item: str, label: str, result: StepResult) -> None:
-    """Emit notes and failed gates of a cut-out, or notes of views, with the path of their picture; or a first look."""
+    """Emit notes and failed gates of a cut-out, or notes of views, with the path of their picture; or a preview."""
     step, notes = result.provenance.step, result.provenance.notes
     if step == LOOKED_AT and FIRST_LOOK in result.outputs:
         if page := _saved_page(item, result.outputs[FIRST_LOOK]):
-            emit(StepEvent(item, label, "remark", text=f"First look, the splats from all sides: {page}"))
+            emit(StepEvent(item, label, "remark", text=f"Preview of the static splats: {page}"))
         return
     if step not in CAPTIONS or (step == COMPARED and not notes):
         return
@@ -56,7 +56,7 @@ def _failed_gates(result: StepResult) -> list[str]:
     except (OSError, ArtifactMissing, StoreUnreachable):
         return []
     return [
-        f"Not accepted: {gate['name']} is {format_value(gate)}, allowed is {format_bounds(gate)}; {gate['advice']}."
+        f"Not accepted: {gate['name']} = {format_value(gate)}, allowed: {format_bounds(gate)}; {gate['advice']}."
         for gate in verdict["gates"]
         if not gate["passed"]
     ]

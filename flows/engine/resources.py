@@ -1,7 +1,7 @@
 """GPU and CPU slots of this machine, shared by all commands of a user, first come, first served.
 
-A slot is a locked file under `$DG4D_HOME/slots`. The kernel frees it when the last process that holds the file has
-ended: this process and the child process of the step.
+A slot is a locked file in `$DG4D_SLOTS`, by default `$DG4D_HOME/slots`. The kernel frees it when the last process that
+holds the file has ended: this process and the child process of the step.
 """
 
 import fcntl
@@ -27,6 +27,7 @@ Resource = Literal["cpu", "gpu"]
 POLL_S = 0.05  # between two attempts to take a slot
 CORES_PER_STEP = 4  # a step does not keep more cores busy all the time
 SHOWN_GPUS = "CUDA_VISIBLE_DEVICES"
+SLOTS_VARIABLE = "DG4D_SLOTS"
 stopping = threading.Event()  # set when the user stops the command: no other step is started
 
 
@@ -79,9 +80,9 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
 
     Raises:
         Stopped: the user stopped the command.
-        BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is invalid.
+        BadInput: `$DG4D_GPUS`, `$DG4D_CPUS` or `$DG4D_SLOTS` is invalid.
     """
-    folder = home() / "slots"
+    folder = slot_folder()
     folder.mkdir(parents=True, exist_ok=True)
     devices = gpus() if resource == "gpu" else tuple(map(str, range(cpus())))
     turn = turn or Turn(time.time_ns(), "another step")
@@ -141,6 +142,20 @@ def cpus() -> int:
     return _number("DG4D_CPUS", max(1, len(os.sched_getaffinity(0)) // CORES_PER_STEP), least=1)
 
 
+def slot_folder() -> Path:
+    """Return the folder of the slots: `$DG4D_SLOTS`, else `$DG4D_HOME/slots`.
+
+    Raises:
+        BadInput: `$DG4D_SLOTS` is a relative path.
+    """
+    given = os.environ.get(SLOTS_VARIABLE)
+    if not given:
+        return home() / "slots"
+    if not Path(given).is_absolute():  # commands in other folders would have slots of their own
+        raise BadInput(f"${SLOTS_VARIABLE} is {given!r}; set it to an absolute path, or unset it")
+    return Path(given)
+
+
 def slots() -> int:
     """Return the number of GPU and CPU slots together.
 
@@ -151,7 +166,7 @@ def slots() -> int:
 
 
 _held: ContextVar[Slot | None] = ContextVar("held", default=None)
-_WORDS: dict[Resource, str] = {"gpu": "a GPU", "cpu": "its turn on the processor"}
+_WORDS: dict[Resource, str] = {"gpu": "a GPU", "cpu": "a CPU slot"}
 
 
 @functools.cache

@@ -164,7 +164,7 @@ class _Shown:
         self._progress.update(done, total, values)
 
     def on_picture(self, label: str, item: str, picture: bytes) -> None:
-        """Keep a picture of the fit so far in the store, and its address in an artifact; it is worth no failed step."""
+        """Store a picture of the running fit and link it in an artifact; errors are ignored."""
         with suppress(httpx.HTTPError, DG4DError, OSError):
             ref = home.store().put_bytes(picture, "image/png")
             create_image_artifact(

@@ -9,7 +9,7 @@ from flows.formatting.numbers import format_number
 WIDTH, HEIGHT = 420, 150  # pixels, of the plot
 LINE = 14  # pixels, of the text below the plot
 LOG_SPAN = 10  # ratio of the largest to the smallest value, from which the scale is logarithmic
-COUNTS = ("Gaussians",)  # series that are no losses; they have no place on the axis of losses
+COUNTS = ("Gaussians",)  # series that are not losses; they are not on the axis of losses
 # in light and in dark color schemes; inks have at least 4.5:1 on the paper, as WCAG AA asks of text
 PAPER, CAPTION = ("#ffffff", "#1f1f25"), ("#666666", "#a1a1aa")
 INKS = (

@@ -298,7 +298,7 @@ class ConversionJob(Frozen):
 
     @property
     def drawn(self) -> bool:
-        """True if a text-to-image model draws the picture."""
+        """True if a text-to-image model generates the picture."""
         return bool(self.text)
 
     def given(self) -> dict[str, ArtifactRef]:
@@ -340,12 +340,12 @@ def job_from_record(
     Args:
         record: provenance of the package.
         store: has the source, or receives it.
-        source: picture, video or folder of frames; needed if the store no longer has it.
-        bank: folder of ground-truth views; likewise.
-        mask: picture or folder of frames that marks the subject; likewise.
-        depth: picture of its depth; likewise.
-        layers: picture of the order of its parts in depth; likewise.
-        asset: model of the user's own; likewise.
+        source: picture, video or folder of frames; this and the next five are needed if the store no longer has them.
+        bank: folder of ground-truth views.
+        mask: picture or folder of frames that marks the subject.
+        depth: picture of its depth.
+        layers: picture of the order of its parts in depth.
+        asset: model of the user's own.
 
     Raises:
         BadInput: the record has another format, a file is needed, or a given file differs from the recorded one.

@@ -138,8 +138,8 @@ class ViewsRequest(Frozen):
             found = same[:1] or [i for i, (path, _) in enumerate(frames) if path.name == source.name]
             if len(found) > 1:
                 raise BadInput(
-                    f"{self.cameras.name} names {len(found)} files {source.name}, and the input is none of them but "
-                    "has their name; give one of them as the input, or rename it"
+                    f"{self.cameras.name} names {len(found)} files {source.name}, and the input has their name but "
+                    "is not one of them; give one of them as the input, or rename it"
                 )
         own = found[0] if found else 0
         return frames[own][1], frames[:own] + frames[own + 1 :]

@@ -28,7 +28,7 @@ _MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
 
 
 def check_model(path: Path) -> None:
-    """Refuse files that are no model, by name and first bytes.
+    """Refuse files that are not a model, by name and first bytes.
 
     Raises:
         BadInput: says what the file is and what to give.
@@ -39,7 +39,10 @@ def check_model(path: Path) -> None:
         raise BadInput(f"--asset: {path} {what}; give a file with one of {allowed}")
     suffix, size = path.suffix.lower(), path.stat().st_size
     if suffix not in FORMATS:
-        raise BadInput(f"--asset: {path} is none of {allowed}; export the model as GLB, or splats as PLY")
+        raise BadInput(
+            f"--asset: {path} has an unsupported format; give one of {allowed}: export the model as GLB, or splats "
+            "as PLY"
+        )
     if not 0 < size <= LARGEST_FILE_BYTES:
         raise BadInput(f"--asset: {path} has {size} bytes; 1 to {LARGEST_FILE_BYTES} are read")
     with path.open("rb") as file:
@@ -102,7 +105,7 @@ def _textures(file: Path) -> Iterator[str]:
         for material in read_mtl(_text(file)).values():
             yield from material.textures
     except ValueError as error:
-        raise BadInput(f"--asset: {file} is no MTL: {error}; export the model again") from error
+        raise BadInput(f"--asset: {file} is not an MTL file: {error}; export the model again") from error
 
 
 def _uris(tree: Any) -> Iterator[str]:
@@ -118,7 +121,7 @@ def _parsed(path: Path) -> Any:
     try:
         return json_text.loads(_text(path))
     except (json_text.UnfitJSON, json.JSONDecodeError, ValueError) as error:
-        raise BadInput(f"--asset: {path} is no glTF: {error}; export it again") from error
+        raise BadInput(f"--asset: {path} is not a glTF file: {error}; export it again") from error
 
 
 def _text(path: Path) -> str:

@@ -28,7 +28,7 @@ def parse_where(given: str = "") -> Where:
         given: empty: `$DG4D_RUNNER`, else `local`; `dask` alone: the scheduler in `$DG4D_RUNNER`.
 
     Raises:
-        BadInput: it is none of these.
+        BadInput: the text is not one of these.
     """
     preset = os.environ.get(VARIABLE, "")
     text, source = (given, "--where") if given else (preset, f"${VARIABLE}")

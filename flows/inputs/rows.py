@@ -28,6 +28,7 @@ NOT_UTF8 = "it is not valid UTF-8; save the manifest as UTF-8"
 
 _TOKEN = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|[\[\]{},]', re.DOTALL)
 _SURROGATE = re.compile("[\ud800-\udfff]")
+_SEPARATOR = re.compile("[;\t]")  # of columns in CSV of spreadsheets whose decimal sign is a comma
 
 
 class ManifestRow(NamedTuple):
@@ -81,8 +82,10 @@ def _table(file: Path) -> list[ManifestRow]:
 
 
 def _csv(text: str) -> list[ManifestRow]:
-    reader = csv.reader(io.StringIO(text, newline=""))
-    columns = next(reader, [])
+    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    columns = [name.strip() for name in next(reader, [])]
+    if len(columns) == 1 and _SEPARATOR.search(columns[0]):
+        raise BadInput(f"the manifest has a single column {quoted(columns[0])}; separate the columns with commas")
     _check_columns(columns)
     rows: list[ManifestRow] = []
     while True:

@@ -136,7 +136,7 @@ def check_still_file(path: Path, option: str) -> None:
     try:
         check_still(path)
     except BadInput as error:
-        raise BadInput(f"{option}: {path.name} is no picture; {wanted}") from error
+        raise BadInput(f"{option}: {path.name} is not a picture; {wanted}") from error
 
 
 def check_text(text: str) -> None:
@@ -160,7 +160,7 @@ def put_source(path: Path, store: ArtifactStore) -> ArtifactRef:
     """Store a picture, a video, or a folder of frames.
 
     Raises:
-        BadInput: it is none of these.
+        BadInput: the path is not one of these.
         DiskFull: the disk is full.
     """
     check_video(path)
@@ -173,7 +173,7 @@ def put_still(path: Path, store: ArtifactStore) -> ArtifactRef:
     """Store a picture.
 
     Raises:
-        BadInput: it is none.
+        BadInput: the file is not a picture.
         DiskFull: the disk is full.
     """
     check_still_file(path, "the picture")

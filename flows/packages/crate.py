@@ -134,7 +134,7 @@ def _entities(record: Mapping[str, Any], beside: Files, about: str, authors: lis
         "@type": "CreativeWork",
         "name": "Rights in the source",
         "description": "The holder of the rights in the source decides on the use of the asset. "
-        + ("The licenses of the weights apply as well." if record["licenses"] else "No weights were used."),
+        + ("The licenses of the weights apply as well." if record["licenses"] else "No downloaded weights were used."),
     }
     for name, terms in record["licenses"].items():
         yield {"@id": _license_id(name), "@type": "CreativeWork", "name": f"License of {name}", "description": terms}

@@ -132,7 +132,7 @@ def provenance(
 
 
 def build_report(job: ConversionJob, result: FlowResult, files: Files, store: ArtifactStore) -> dict[str, Any]:
-    """Return stages, times, curves, notes and settings as JSON."""
+    """Return steps, times, curves, notes and settings as JSON."""
     return {
         "item": job.item,
         "source": job.source_name,
@@ -164,18 +164,18 @@ def banner(job: ConversionJob, result: FlowResult) -> str:
 
 
 def _shape(job: ConversionJob, result: FlowResult) -> str:
-    """Say which part of the shape was given, and how the rest was guessed."""
+    """Say which part of the shape was given, and how the rest was predicted."""
     if job.asset is not None:
         return "the shape is that of the given model"
     if job.settings.prior.kind == "learned" and not result.used_weights("generate_views"):
-        guessed, source = "by a small network", " from one view"
+        predicted, source = "by the shape network", " from one view"
     elif result.used_weights("generate_views", "fit_gaussians", "fit_motion"):
-        guessed, source = "by a model", ""
+        predicted, source = "by a model", ""
     else:
-        guessed, source = "without a model", ", from the silhouette of one picture"
+        predicted, source = "without a model", ", from the silhouette of one picture"
     if job.views is not None:
-        return f"the shape was fitted to the given views; what none of them shows was guessed {guessed}"
-    return f"shape and unseen sides were guessed {guessed}{source}"
+        return f"the shape was fitted to the given views; what none of them shows was predicted {predicted}"
+    return f"shape and unseen sides were predicted {predicted}{source}"
 
 
 def notes(job: ConversionJob, result: FlowResult) -> list[str]:

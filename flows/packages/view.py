@@ -84,14 +84,14 @@ def viewer_of_package(package: Path, title: str) -> str:
 
 
 def viewer_of_splats(splats: bytes, title: str) -> str:
-    """Render the page of web splats without a mesh: the first look at an asset whose motion is being fitted.
+    """Render the page of web splats without a mesh: a preview of an asset whose motion is being fitted.
 
     Args:
         splats: output of `write_web_splats`.
         title: name of the asset.
     """
-    facts = {"First look": {"shown": "the splats of the first frame", "to come": "motion, mesh and files"}}
-    return build_viewer_page(f"{title}: first look", None, splats, None, None, facts)
+    facts = {"Preview": {"shown": "the splats of the first frame", "to come": "motion, mesh and files"}}
+    return build_viewer_page(f"{title}: static splats", None, splats, None, None, facts)
 
 
 def viewer_of_artifact(path: Path, title: str) -> str:
@@ -109,7 +109,8 @@ def viewer_facts(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the facts that the page lists, without those of a single run."""
     return {
         "Provenance": {name.replace("_", " "): record[name] for name in PROVENANCE if name in record},
-        "Licenses": record.get("licenses") or "No weights were used: no model license applies to this asset.",
+        "Licenses": record.get("licenses")
+        or "No downloaded weights were used; no model license applies to this asset.",
         "Steps": {
             f"{number}. {step['step']}": {key: value for key, value in step.items() if key != "step" and value != {}}
             for number, step in enumerate(record.get("steps", ()), 1)

@@ -96,6 +96,12 @@ def is_foreign(headers: Headers, method: str) -> bool:
     return method not in READING and headers.get("sec-fetch-site", "none") not in OWN_SITES
 
 
+UNAUTHORIZED = (
+    "Unauthorized: sign in at the address that `dg4d up` or `dg4d studio` prints, or, on a server of your own, at "
+    f"{LOGIN}#NAME:PASSWORD with the value of its $PREFECT_SERVER_API_AUTH_STRING."
+)
+
+
 class SignIn:
     """Sign-in of browsers to the routes below `/dg4d/`: they need the secret, or the cookie it was exchanged for.
 
@@ -118,7 +124,7 @@ class SignIn:
             query = f"?{request.url.query}" if request.url.query else ""
             wanted = quote(request.scope["path"]) + query
             raise HTTPException(303, headers={"Location": f"{LOGIN}?next={quote(wanted)}"})
-        raise HTTPException(401, "Unauthorized: sign in at the address that `dg4d up` prints.")
+        raise HTTPException(401, UNAUTHORIZED)
 
     def session(self, request: Request) -> Response:
         """Exchange the secret for a cookie."""

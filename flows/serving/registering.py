@@ -42,24 +42,25 @@ def _trigger(after: str, expect: set[str], within_s: float) -> EventTrigger:
 
 AUTOMATIONS = (
     AutomationCore(
-        name="dg4d: runs whose process died",
-        description="Marks runs as crashed whose worker or machine died without a report.",
+        name="dg4d: mark orphaned runs as crashed",
+        description="Marks runs as crashed whose worker or machine stopped without a report.",
         trigger=_trigger(ALIVE, {ALIVE, CRASHED, *ENDINGS}, MISSED * HEARTBEAT_S),
         actions=[
             ChangeFlowRunState(
                 state=StateType.CRASHED,
                 name=None,
-                message=f"no heartbeat for {MISSED * HEARTBEAT_S} s: its process was killed, or its machine is gone",
+                message=f"no heartbeat for {MISSED * HEARTBEAT_S} s: process killed or machine unreachable",
             )
         ],
     ),
     AutomationCore(
-        name="dg4d: runs that died go on",
+        name="dg4d: resume crashed runs",
         description="Resumes crashed runs on any worker; a run that crashes repeatedly fails.",
         trigger=_trigger(CRASHED, BEGINNINGS | ENDINGS, REPORTED_S),
-        actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="its process died")],
+        actions=[ChangeFlowRunState(state=StateType.SCHEDULED, name="AwaitingRetry", message="resumed after a crash")],
     ),
 )
+RENAMED = ("dg4d: runs whose process died", "dg4d: runs that died go on")  # names of these in earlier versions
 
 
 def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
@@ -129,6 +130,9 @@ def _deploy(names: list[str]) -> None:
 
 
 def _automate(client: SyncPrefectClient) -> None:
+    for name in RENAMED:
+        for old in client.read_automations_by_name(name):
+            client.delete_automation(old.id)
     for automation in AUTOMATIONS:
         known = client.read_automations_by_name(automation.name)
         for surplus in known[1:]:  # of commands on several machines at the same time

@@ -85,7 +85,7 @@ class Server:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.auth_string()  # creates the secret
         if self._in_use is None:
-            self._in_use = (self.folder / "in-use").open("a")
+            self._in_use = (self.folder / "in-use").open("a+")
             fcntl.flock(self._in_use, fcntl.LOCK_SH)  # waits for a guard that is ending its server
         if not self.is_guarded():
             arguments = (str(self.folder), str(self.prefect_home))

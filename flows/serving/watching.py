@@ -158,7 +158,7 @@ def check_registered() -> None:
             is_there = False
     if not is_there:
         raise BackendUnavailable(
-            f'no deployment "{DEPLOYMENT.partition("/")[2]}" with its trigger on the Prefect server, which converts '
+            f'the Prefect server has no deployment "{DEPLOYMENT.partition("/")[2]}" with its trigger, which converts '
             "the files; run `dg4d up` first"
         )
 

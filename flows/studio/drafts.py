@@ -178,7 +178,7 @@ class Draft:
             size: width and height of the source in pixels.
 
         Raises:
-            BadInput: it is no PNG, or empty.
+            BadInput: the picture is not a PNG, or is empty.
             DiskFull: there is no room.
         """
         try:
@@ -188,7 +188,7 @@ class Draft:
                     raise BadInput(f"the mask has {width} x {height} pixels; its sides may have at most {MASK_SIDES}")
                 drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise BadInput("the mask is no PNG that can be read; draw it again") from error
+            raise BadInput("the mask is not a readable PNG; paint it again") from error
         if drawn.getextrema() == (0, 0):
             raise BadInput("the mask is empty: paint over the subject with the brush `keep`")
         png = io.BytesIO()

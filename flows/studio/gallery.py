@@ -254,5 +254,5 @@ def _json(_store: str, digest: str) -> dict[str, Any]:
     content = home.store().read(object_name(digest))
     tree = None if content is None else json.loads(content)
     if not isinstance(tree, dict):
-        raise ValueError(f"{digest} is gone, or no JSON object")
+        raise ValueError(f"{digest} is missing, or is not a JSON object")
     return tree

@@ -25,8 +25,8 @@ MOTIONS: tuple[str, ...] = get_args(Motion)
 DESCRIPTIONS = {
     "preview": "minutes on any machine, no model",
     "paper": "the paper's numbers; GPU and weights",
-    "video": "for footage, 32 frames; GPU and weights",
-    "video-fast": "for footage, 16 frames; GPU and weights",
+    "video": "for input videos, 32 frames; GPU and weights",
+    "video-fast": "for input videos, 16 frames; GPU and weights",
     "release": "the public code's first release; GPU and weights",
     "reference": "the authors' public code; GPU and weights",
     "quality": "best of four motions, finer mesh; GPU and weights",

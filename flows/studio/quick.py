@@ -77,7 +77,7 @@ def cut_out(draft: Draft, upload: Upload, box: tuple[int, ...] = ()) -> CutOut:
 
     Raises:
         StepError: the file cannot be read.
-        BadInput: the box is none.
+        BadInput: the box is invalid, or the file is a model.
     """
     if upload.kind == "model":
         raise BadInput("a model has no background to cut away")
@@ -91,7 +91,7 @@ def cut_out(draft: Draft, upload: Upload, box: tuple[int, ...] = ()) -> CutOut:
 
 
 def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bool = False) -> list[Film]:
-    """Return films of the motions that a profile can choose from; none where a model makes up the motion.
+    """Return films of the motions that a profile can choose from; none where a model generates the motion.
 
     Raises:
         StepError: the file cannot be read, or has no subject.

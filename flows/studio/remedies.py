@@ -88,13 +88,13 @@ LOW: Mapping[str, tuple[Candidate, ...]] = {  # for values below the bounds
 }
 HIGH: Mapping[str, tuple[Candidate, ...]] = {  # for values above them
     "flicker": (_set("a smoother motion", deformation__smoothness_weight=0.01), LONGER_MOTION, SMOOTHER_MODEL),
-    "floaters splats": (_times("faint splats pruned", "static.prune_opacity", factor=3),),
-    "floaters mesh": (_times("small pieces removed", "mesh.min_component", factor=3),),
+    "floaters splats": (_times("a higher opacity threshold", "static.prune_opacity", factor=3),),
+    "floaters mesh": (_times("a higher size threshold for pieces", "mesh.min_component", factor=3),),
     "flaws": (_other_surface, FINER_GRID, STIFFER_MODEL),
     "folds": (FRAME_MESHES, _times("a coarser mesh grid", "mesh.grid", factor=0.75), STIFFER_MODEL),
-    "sharpness": (_times("a lower color rate", "static.color_lr", factor=0.5),),
+    "sharpness": (_times("a lower color learning rate", "static.color_lr", factor=0.5),),
     "motion": (
-        _times("slower motion rates", "motion.plane_lr", "motion.network_lr", factor=0.5),
+        _times("lower motion learning rates", "motion.plane_lr", "motion.network_lr", factor=0.5),
         SMOOTHER_MODEL,
     ),
 }

@@ -18,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from dg4d_lib.errors import DG4DError
 from flows import home
 from flows.prefect_compat import add_first
-from flows.serving.access import SignIn
+from flows.serving.access import UNAUTHORIZED, SignIn
 from flows.serving.addresses import STUDIO_ADDRESS
 from flows.serving.auth import is_authorized
 from flows.step_errors import StepError
@@ -64,7 +64,7 @@ def add_routes(application: FastAPI, sign_in: SignIn, secret: str) -> None:
             HTTPException: 401.
         """
         if not is_authorized(request.headers.get("authorization"), secret):
-            raise HTTPException(401, "Unauthorized: sign in again at the address that `dg4d studio` prints.")
+            raise HTTPException(401, UNAUTHORIZED)
 
     for route in routes(ServerApi(application, secret)):
         methods, needed = (["POST"], with_secret) if route.changes else (["GET", "HEAD"], sign_in.required)
@@ -173,7 +173,7 @@ def _explained(answer: Answer) -> Answer:
     async def explained(request: Request) -> Response:
         try:
             return await answer(request)
-        except (DG4DError, StepError, LookupError, ValidationError) as error:
+        except (DG4DError, LookupError, ValidationError) as error:
             return JSONResponse({"detail": _sentence(error)}, _status(error), headers=HEADERS)
 
     return explained

@@ -43,7 +43,9 @@ class ServerApi:
         """
         found = await self._client.get(f"/deployments/name/{deployment}")
         if found.status_code == httpx.codes.NOT_FOUND:
-            raise HTTPException(409, f"the deployment {deployment!r} is not registered; run `dg4d studio` again")
+            raise HTTPException(
+                409, f"the deployment {deployment!r} is not registered; run `dg4d up` with its work pool (--pool)"
+            )
         wanted = {"parameters": dict(parameters), "name": name, "tags": [TAG, *tags]}
         answer = await self._client.post(f"/deployments/{found.json()['id']}/create_flow_run", json=wanted)
         if answer.status_code >= httpx.codes.BAD_REQUEST:

@@ -47,7 +47,7 @@ TITLES = {
     "join_meshes": "Join the meshes",
     "refine_texture": "Refine the texture",
     "pack_asset": "Write the files",
-    "check_asset": "Judge the result",
+    "check_asset": "Check the quality",
 }
 USUAL = ("prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh", "pack_asset",
          "check_asset")  # fmt: skip
@@ -77,7 +77,7 @@ class RunStatus(Frozen):
         left: estimate of the time left, in words; empty while it is unknown.
         picture: address of the newest picture of the asset; empty if there is none.
         first_look: address of the page with its static splats; empty before there are any.
-        asset: address of the page of the asset, once it is made.
+        asset: address of the page of the asset; empty before it is finished.
         items: name and state of the items of a batch.
     """
 
@@ -212,12 +212,12 @@ def message_of(run: Row) -> str:
     """Return the reason of a failure as a sentence; empty for other states."""
     state = run["state"] or {}
     if state.get("type") == "SCHEDULED" and state.get("name") == "AwaitingRetry":
-        return "Its process was killed. It goes on after the last finished step in a moment."
+        return "The process was killed. The run resumes after the last finished step shortly."
     if state.get("type") == "CRASHED":
-        return "Its process was killed or its machine is gone. It is started again by itself within a minute."
+        return "The process was killed or its machine is unreachable. The run restarts automatically within a minute."
     if state.get("type") != "FAILED":
         return ""
-    return WRAPPING.sub("", str(state.get("message") or "It failed; see its page in Prefect."))
+    return WRAPPING.sub("", str(state.get("message") or "The run failed; see its page in Prefect."))
 
 
 def name_of(run: Row) -> str:

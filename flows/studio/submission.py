@@ -193,7 +193,7 @@ def _mask(draft: Draft, wanted: Submission, first: Upload, key: str) -> str:
     if not wanted.masked:
         return ""
     if first.kind != "picture":
-        raise BadInput("the brush marks the subject of a picture; of a video draw a box, which holds for all frames")
+        raise BadInput("the brush works on pictures only; draw a box, which applies to all frames of a video")
     return str(draft.link(key, "mask.png", draft.drawn_mask()))
 
 
@@ -201,7 +201,7 @@ def _view(draft: Draft, view: SideView, first: Upload, key: str) -> str:
     """Return a view as `--view` takes it."""
     upload = draft.upload(view.file)
     if upload.path == first.path or upload.kind != "picture":
-        raise BadInput(f"{view.file} is no picture of another side")
+        raise BadInput(f"{view.file} is not a picture of another side")
     path = draft.link(key, f"view-{upload.name}", upload.path)
     return f"{view.azimuth:g},{view.elevation:g}={path}"
 

@@ -15,15 +15,15 @@ from steps.store.artifact_store import ArtifactStore
 
 PICTURES = {
     ("pack_asset", "sheet"): "Contact sheet",
-    ("draw_picture", "picture"): "Drawn from the text",
+    ("draw_picture", "picture"): "Generated from the prompt",
     ("prepare_subject", "picture"): "Input, matte, cut-out",
-    ("prepare_views", "picture"): "Views, and the hull that they share",
-    ("generate_views", "picture"): "Drawn views, faded where they disagree, and the hull that they share",
+    ("prepare_views", "picture"): "Views and their visual hull",
+    ("generate_views", "picture"): "Generated views (faded where they disagree) and their visual hull",
     ("drive_video", "picture"): "Driving video",
-    ("fit_gaussians", "picture"): "At rest, from all around",
-    ("fit_motion", "picture"): "In motion, from the front and from the side",
-    ("extract_mesh", "picture"): "Mesh, from all around",
-    ("check_asset", "picture"): "Worst timestamps: input, splats, mesh",
+    ("fit_gaussians", "picture"): "Static Gaussians from all sides",
+    ("fit_motion", "picture"): "Animation from the front and from the side",
+    ("extract_mesh", "picture"): "Mesh from all sides",
+    ("check_asset", "picture"): "Worst frames: input, splats, mesh",
 }
 
 

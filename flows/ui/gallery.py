@@ -67,7 +67,7 @@ def gallery_page(name: str, line: str, rows: list[Row], out: Path) -> str:
     head = [f"# {markdown(name)}", "", line, ""]
     if len(rows) > ROWS_SHOWN:
         head += [f"{ROWS_SHOWN} of {len(rows)} are shown; all are in summary.csv and index.html of the folder.", ""]
-    table = ["| | item | verdict | seconds | |", "|---|---|---|---|---|"]
+    table = ["| | item | result | seconds | |", "|---|---|---|---|---|"]
     return "\n".join([*head, *table, *_lines(shown, out)]) + "\n"
 
 

@@ -50,7 +50,7 @@ def step_page(label: str, item: str, result: StepResult, store: ArtifactStore) -
     lines = [f"# {label}: {markdown(item)}", ""]
     lines += [f"{image}\n" for image in pictures_of(result.outputs, store)]
     if FIRST_LOOK in result.outputs:
-        lines += [f"[First look: the splats from all sides]({first_look_address(result.outputs[FIRST_LOOK])})", ""]
+        lines += [f"[Preview of the static splats]({first_look_address(result.outputs[FIRST_LOOK])})", ""]
     lines += [f"> {markdown(note)}\n" for note in (*record.notes, *record.run_notes)]
     for ref in result.outputs.values():
         if ref.media_type.endswith("curves+json"):

@@ -92,7 +92,7 @@ class PictureTo4D(_Maker):
             "MASK",
             {"tooltip": "as Load Image returns it: 1 where the picture is transparent; empty: cut out by dg4d"},
         )
-        side = ("IMAGE", {"tooltip": "the same subject at the first moment, seen from this azimuth, counter-clockwise"})
+        side = ("IMAGE", {"tooltip": "the same subject in the first frame, seen from this azimuth, counter-clockwise"})
         motion = (MOTIONS, {"tooltip": "motion that needs no model"})
         return {
             "required": {"image": ("IMAGE",), "motion": motion, **_common()},
@@ -183,7 +183,7 @@ class Views4D:
                 ),
                 "loops": (
                     "INT",
-                    {"default": 1, "min": 0, "max": 16, "tooltip": "of the animation; 0: the first moment"},
+                    {"default": 1, "min": 0, "max": 16, "tooltip": "of the animation; 0: the first frame"},
                 ),
                 "count": ("INT", {"default": 24, "min": 1, "max": 512, "tooltip": "number of renders"}),
                 "size": ("INT", {"default": 512, "min": 16, "max": 2048, "step": 16, "tooltip": "pixels of a side"}),
@@ -249,7 +249,7 @@ def setting_lines(text: str) -> list[str]:
     """Return the settings of a text, one NAME=VALUE per line; empty lines and those after # are left out.
 
     Raises:
-        ValueError: a line is no setting.
+        ValueError: a line is not a setting.
     """
     lines = [line.partition("#")[0].strip() for line in text.splitlines()]
     wrong = [line for line in lines if line and "=" not in line]

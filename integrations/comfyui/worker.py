@@ -121,7 +121,7 @@ def main() -> int:
         emit("result", value=value)
     except KeyboardInterrupt:
         return INTERRUPTED
-    except (dg4d.DG4DError, dg4d.StepError) as error:
+    except dg4d.DG4DError as error:
         _finished.set()
         emit("error", message=str(error))
     return 0

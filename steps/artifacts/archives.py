@@ -68,14 +68,14 @@ def unpack(path: Path, folder: Path, what: str, wanted: Callable[[str], bool] = 
         wanted: filter for the names of the files.
 
     Raises:
-        BadInput: the file is no zip, or is broken, or has unsafe, too many or too large entries.
+        BadInput: the file is not a zip, or is broken, or has unsafe, too many or too large entries.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             entries = [entry for entry in _checked_entries(archive, what) if wanted(entry.filename)]
             archive.extractall(folder, entries)
     except ZIP_ERRORS as error:
-        raise BadInput(f"{what} is broken, encrypted, or no zip: {error}") from error
+        raise BadInput(f"{what} is broken, encrypted, or not a zip: {error}") from error
     except OSError as error:
         if error.errno not in UNFIT_ERRNOS and error.errno is not None:  # damaged bzip2 data has no errno
             raise

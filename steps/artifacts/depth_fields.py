@@ -24,16 +24,17 @@ def read_depth_field(path: Path) -> DepthField:
     """Read a field that `write_depth_field` wrote.
 
     Raises:
-        BadInput: the file is no field, or nothing is known in it.
+        BadInput: the file is not a field, or nothing is known in it.
     """
     try:
         about, tensors = read_tensors(path, KEY)
         middle, known, sigma = tensors["middle"], tensors["known"], float(about["sigma"])
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise BadInput(
-            f"{path.name} is no depth field ({type(error).__name__}); give the output `depth_field` of prepare_subject"
+            f"{path.name} is not a depth field ({type(error).__name__}); give the output `depth_field` of "
+            "prepare_subject"
         ) from error
     square = middle.ndim == 2 and len(set(middle.shape)) == 1 and middle.shape == known.shape
     if not square or known.dtype != torch.bool or not known.any():
-        raise BadInput(f"{path.name} is no depth field: {tuple(middle.shape)} values, {int(known.sum())} known")
+        raise BadInput(f"{path.name} is not a depth field: {tuple(middle.shape)} values, {int(known.sum())} known")
     return DepthField(middle.float(), known, sigma)

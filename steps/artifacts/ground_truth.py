@@ -79,7 +79,7 @@ def find_ground_truth(place: Path) -> GroundTruth:
     if place.is_file() and place.suffix.lower() in PICTURES:
         return GroundTruth(name=place.stem, inputs=(place,))
     if not place.is_dir():
-        raise BadInput(f"{place} is no ground truth: give a folder of an object, or a picture")
+        raise BadInput(f"{place} is not ground truth: give a folder of an object, or a picture")
     views = [TrueView(azimuth_deg=azimuth, frames=tuple(_pictures(path))) for azimuth, path in _view_folders(place)]
     truth = GroundTruth(
         name=place.absolute().name,
@@ -99,7 +99,7 @@ def find_ground_truths(dataset: Path) -> list[GroundTruth]:
         BadInput: there are none, or one of them is not complete.
     """
     if not dataset.is_dir():
-        raise BadInput(f"{dataset} is no data set: give a folder that holds a folder per object")
+        raise BadInput(f"{dataset} is not a data set: give a folder that holds a folder per object")
     root = dataset / "gt" if (dataset / "gt").is_dir() else dataset
     if _view_folders(root) or (root / INPUT).is_dir():
         return [find_ground_truth(root)]
@@ -139,8 +139,8 @@ def _inputs(folder: Path) -> list[Path]:
     known = {path for _, path in _view_folders(folder)} | {folder / BANK, folder / "static"}
     others = [path for path in sorted(folder.iterdir()) if path.is_dir() and path not in known and _pictures(path)]
     if len(others) != 1:
-        named = f" ({', '.join(path.name for path in others)}: which?)" if others else ""
-        raise BadInput(f"{folder} has no input{named}: put the frames that are given into {folder / INPUT}")
+        named = f", and several folders could be the input: {', '.join(path.name for path in others)}" if others else ""
+        raise BadInput(f"{folder} has no {INPUT}/{named}; put the input frames into {folder / INPUT}")
     return _pictures(others[0])
 
 
@@ -158,7 +158,7 @@ def _check(truth: GroundTruth, folder: Path) -> None:
         counts = {INPUT: len(truth.inputs), **counts}
     if len(set(counts.values())) > 1 or 0 in counts.values():
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise BadInput(f"the views of {folder} must have as many frames as each other; they have: {listed}")
+        raise BadInput(f"the views of {folder} must have equal numbers of frames; they have: {listed}")
     if len({view.azimuth_deg for view in truth.views}) < len(truth.views):
         raise BadInput(f"{folder} has two folders of one view; keep one")
     if (folder / CAMERAS).is_file():
@@ -177,7 +177,7 @@ def _check_cameras(path: Path, truth: GroundTruth) -> None:
             if abs(float(camera[what]) - value) > CLOSE
         ]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BadInput(f"{path} does not say how every view was taken: {error!r}") from error
+        raise BadInput(f"{path} does not give the camera of every view: {error!r}") from error
     if wrong:
         expected = ", ".join(f"{what} {value:g}" for what, value in CAMERA.items())
         raise BadInput(f"{path}: views must be taken with {expected}; {'; '.join(wrong)}")

@@ -83,7 +83,7 @@ def read_tensors(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor
     """Return the JSON under a key of a safetensors file's metadata, and its tensors.
 
     Raises:
-        SafetensorError: the file is no safetensors file.
+        SafetensorError: the file is not a safetensors file.
         KeyError: its metadata lack the key.
     """
     with safe_open(path, "pt") as file:

@@ -14,11 +14,13 @@ class MeshPlan(Frozen):
 
     mode: Literal["tracked", "per_frame"]
     reference_frame: int = Field(0, ge=0, description="frame whose surface is extracted (tracked) or sets the level")
-    other_candidates: tuple[NonNegativeInt, ...] = Field((), description="frames whose surfaces are tracked, too")
+    other_candidates: tuple[NonNegativeInt, ...] = Field((), description="other frames whose surfaces are also tracked")
     followed: float = Field(1.0, description="IoU of outlines over the motion, of the best trial mesh; 1 if none")
     level: float = Field(description="density of the surface")
     grid: int | None = Field(None, ge=16, le=512, description="cells of the density field per axis; none: `mesh.grid`")
-    guide: Literal["gaussians", "video"] = Field("gaussians", description="what the vertices of a tracked mesh follow")
+    guide: Literal["gaussians", "video"] = Field(
+        "gaussians", description="motion that the vertices of a tracked mesh follow"
+    )
 
 
 def write_plan(path: Path, plan: MeshPlan) -> None:
@@ -30,9 +32,9 @@ def read_plan(path: Path) -> MeshPlan:
     """Read a file of `write_plan`.
 
     Raises:
-        BadInput: the file is no plan.
+        BadInput: the file is not a plan.
     """
     try:
         return MeshPlan.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise BadInput(f"{path.name} is no plan of a mesh ({error}); give the `plan` output of plan_mesh") from error
+        raise BadInput(f"{path.name} is not a plan of a mesh ({error}); give the `plan` output of plan_mesh") from error

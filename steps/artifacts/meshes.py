@@ -28,7 +28,7 @@ def read_tracked(path: Path) -> TrackedMesh:
     """Read a file of `write_tracked`.
 
     Raises:
-        BadInput: the file is no tracked mesh.
+        BadInput: the file is not a tracked mesh.
     """
     try:
         about, tensors = read_tensors(path, "tracked")
@@ -36,7 +36,7 @@ def read_tracked(path: Path) -> TrackedMesh:
         return TrackedMesh(_mesh(tensors), tensors["offsets"], textures, float(about["rest"]))
     except (SafetensorError, KeyError) as error:
         raise BadInput(
-            f"{path.name} is no tracked mesh ({error}); give the `tracked` output of extract_mesh"
+            f"{path.name} is not a tracked mesh ({error}); give the `tracked` output of extract_mesh"
         ) from error
 
 
@@ -70,8 +70,11 @@ def _tensors(mesh: TexturedMesh) -> dict[str, Tensor]:
         "uvs": mesh.uvs.detach().cpu().float(),
         "texture": to_bytes(mesh.texture),
     }
+    if mesh.smoothing_groups is not None:
+        tensors["smoothing_groups"] = mesh.smoothing_groups.cpu().to(torch.int32)
     return {name: value.contiguous() for name, value in tensors.items()}
 
 
 def _mesh(tensors: Mapping[str, Tensor]) -> TexturedMesh:
-    return TexturedMesh(tensors["vertices"], tensors["faces"], tensors["uvs"], tensors["texture"].float() / 255)
+    texture, groups = tensors["texture"].float() / 255, tensors.get("smoothing_groups")
+    return TexturedMesh(tensors["vertices"], tensors["faces"], tensors["uvs"], texture, groups)

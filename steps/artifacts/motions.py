@@ -66,12 +66,12 @@ def read_motion(path: Path) -> FittedMotion:
     """Read a file of `write_motion`.
 
     Raises:
-        BadInput: the file is no motion.
+        BadInput: the file is not a motion.
     """
     try:
         about, tensors = read_tensors(path, "motion")
     except (SafetensorError, KeyError) as error:
-        raise BadInput(f"{path.name} is no motion ({error}); give the `motion` output of fit_motion") from error
+        raise BadInput(f"{path.name} is not a motion ({error}); give the `motion` output of fit_motion") from error
     settings: DeformationSettings = TypeAdapter(DeformationSettings).validate_python(about["settings"])
     deformation = from_state_dict(settings, tensors, about["frames"], about["gaussians"])
     return FittedMotion(deformation, about["frames"], settings)

@@ -40,15 +40,15 @@ ABOUT = {
     PLAYBACK: "the same mesh on a skeleton that follows the motion roughly, glTF 2.0",
     USD: "animated mesh, on a skeleton if one follows the motion, USDZ",
     USD_SPLATS: "moving splats, and as a variant point samples of the mesh, USDZ",
-    WEB_SPLATS: "moving splats for the viewer",
-    GAUSSIANS: "Gaussians at rest, 3DGS PLY",
+    WEB_SPLATS: "splats of all frames, format of the viewer",
+    GAUSSIANS: "Gaussians in the canonical pose, 3DGS PLY",
     COMPACT: "Gaussians and their deformation over time, safetensors",
-    SUBJECT: "the cut-out input",
-    DRIVING: "what the motion follows, MP4",
-    PREVIEW: "it moves while the camera goes round, MP4",
-    TURNTABLE: "the first moment, turned once, MP4",
-    MOVING_PICTURE: "it moves, animated WebP",
-    SHEET: "moments by angles",
+    SUBJECT: "input picture, cut out",
+    DRIVING: "driving video, MP4",
+    PREVIEW: "preview of the animation with an orbiting camera, MP4",
+    TURNTABLE: "first frame on a turntable, MP4",
+    MOVING_PICTURE: "preview of the animation, animated WebP",
+    SHEET: "contact sheet: columns are frames, rows are azimuths",
 }
 ABOUT_FOLDERS = {
     (SPLATS, ".ply"): "Gaussians of one frame, 3DGS PLY in OpenCV axes (y down)",
@@ -149,11 +149,11 @@ def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of an unpacked package.
 
     Raises:
-        BadInput: the folder is no package, or its manifest is broken or of another version.
+        BadInput: the folder is not a package, or its manifest is broken or of another version.
     """
     path = folder / MANIFEST
     if not path.is_file():
-        raise BadInput(f"{folder} is no asset: it has no {MANIFEST}; give a folder that `dg4d make` wrote")
+        raise BadInput(f"{folder} is not an asset: it has no {MANIFEST}; give a folder that `dg4d make` wrote")
     try:
         return Manifest.model_validate_json(path.read_bytes())
     except ValidationError as error:

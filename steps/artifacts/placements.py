@@ -34,13 +34,13 @@ def read_placement(path: Path) -> Placement:
     """Read a file of `write_placement`.
 
     Raises:
-        BadInput: the file is no placement.
+        BadInput: the file is not a placement.
     """
     try:
         stored = StoredPlacement.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise BadInput(
-            f"{path.name} is no placement ({error}); give the `placement` output of prepare_asset"
+            f"{path.name} is not a placement ({error}); give the `placement` output of prepare_asset"
         ) from error
     values = stored.model_dump()
     return Placement(**{**values, "quat": torch.tensor(stored.quat), "shift": torch.tensor(stored.shift)})

@@ -25,7 +25,7 @@ def read_turn(path: Path | None) -> float | None:
     """Return the turn of the subject that its footage shows, degrees; None if it shows none or without a file.
 
     Raises:
-        BadInput: the file is no pose.
+        BadInput: the file is not a pose.
     """
     if path is None:
         return None
@@ -33,5 +33,5 @@ def read_turn(path: Path | None) -> float | None:
         return Pose.model_validate_json(path.read_bytes()).turn_deg
     except ValidationError as error:
         raise BadInput(
-            f"{path.name} is no pose of a subject ({error}); give the `pose` output of prepare_subject"
+            f"{path.name} is not a pose of a subject ({error}); give the `pose` output of prepare_subject"
         ) from error

@@ -83,7 +83,7 @@ def render_package(
             instead of that of the input picture.
 
     Raises:
-        BadInput: the folder is no package, a broken one, or too old for `fit`, a number is out of range, or a view
+        BadInput: the folder is not a package, a broken one, or too old for `fit`, a number is out of range, or a view
             holds pictures of more frames.
         BackendUnavailable: the rasterizer cannot run here.
         OSError: a picture could not be written.

@@ -62,15 +62,17 @@ from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 from steps.sources.banks import BANK_JSON, BankIndex, check_sheet, read_index
 
-GEOMETRIC_NOTE = "prior: inflation of the silhouette (no model); sides the picture does not show are guesses"
-LEARNED_NOTE = "prior: shape network trained on made-up shapes; sides the picture does not show are guesses"
+GEOMETRIC_NOTE = (
+    "prior: inflation of the silhouette, without a network; sides that the picture does not show are guesses"
+)
+LEARNED_NOTE = "prior: shape network trained on synthetic shapes; sides that the picture does not show are guesses"
 DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimated depth: weights"
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
-NETWORK_TRUST = 4 / 3  # of the turn that the inflation takes: the network's own opinion holds against it
+NETWORK_TRUST = 4 / 3  # factor on the yaw: the network's own estimate counteracts it
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 STABLE_UNET = KNOWN["stable-zero123"].published["unet/diffusion_pytorch_model.safetensors"]  # sha256
-ORACLE_NOTE = "prior: the true views of a bank; for tests and benchmarks only"
+ORACLE_NOTE = "prior: ground-truth views of a bank; for tests and benchmarks only"
 
 
 class Tracked(NamedTuple):
@@ -175,7 +177,7 @@ def make_prior(
             return LoadedPrior(prior, note, opened, shapes=shapes, network=network)
         case OraclePriorSettings():
             if bank is None:
-                raise BadInput("prior.kind = oracle needs true views: give --bank FOLDER (with a bank.json)")
+                raise BadInput("prior.kind = oracle needs ground-truth views: give --bank FOLDER (with a bank.json)")
             return LoadedPrior(make_oracle_prior(read_bank(bank, scratch), settings, noise), ORACLE_NOTE)
         case Zero123PriorSettings():
             opened = open_zero123("prior", settings)
@@ -285,7 +287,7 @@ def known_by_frame(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]
 
 
 def still_views(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]:
-    """Return the views in a bank, by frame, if they show a single moment of a video of some frames.
+    """Return the views in a bank, by frame, if they show a single frame of a video of several.
 
     Videos of other sides would draw the motion fit away from the input: one picture per iteration is a noisy sample.
     """
@@ -295,8 +297,8 @@ def still_views(bank: Bank | None, frames: int) -> dict[int, list[KnownView]]:
 def known_note(bank: Bank | None, has_predictions: bool) -> str:
     """Return the sentence about known views, and about the shape network if its predictions count."""
     count = len(bank.cameras) if bank is not None else 0
-    network = ", without what the shape network finds improbable" if has_predictions else ""
-    return f"prior: visual hull of {count + 1} views{network}; what none of them shows is a guess"
+    network = ", minus cells that the shape network finds improbable" if has_predictions else ""
+    return f"prior: visual hull of {count + 1} views{network}; surfaces that no view shows are guesses"
 
 
 def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None, turn_deg: float) -> DepthHint:
@@ -312,7 +314,7 @@ def subject_hint(settings: PriorSettings, pose: Path | None, field: Path | None,
 
 
 def usable_turn(settings: PriorSettings, shown_deg: float | None) -> float | None:
-    """Return the turn that a prior takes where footage shows one, degrees; None where it shows none.
+    """Return the yaw that a prior should use, degrees; None if the video shows none.
 
     The inflation takes it as it is. For the shape network it is evidence beside what the network sees itself.
     """
@@ -354,7 +356,7 @@ def open_zero123(owner: str, settings: Zero123PriorSettings) -> LocatedWeights:
 
 
 def _open_noise_predictor(owner: str, name: str) -> LocatedWeights:
-    """Return installed weights; refuse models of flow matching, which are no critics of score distillation."""
+    """Open installed weights; refuse flow-matching models, which do not predict noise."""
     opened = open_weights(name)
     if is_flow_matching(opened.folder):
         raise BadInput(flow_matching_refusal(owner, name))

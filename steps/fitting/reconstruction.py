@@ -16,7 +16,7 @@ from dg4d_lib.settings import LgmStartSettings
 from steps.runtime.job import StepReport
 from steps.runtime.weights import LocatedWeights, open_weights
 
-NOTE = "start: Gaussians reconstructed by LGM from four views that ImageDream made of the picture"
+NOTE = "start: Gaussians reconstructed by LGM from four views that ImageDream generated from the picture"
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.shape import ALL_AROUND
 from steps.fitting.priors import Tracked
 
-TRACKED_NOTE = "motion of unseen sides: the surface of the known views, moved as the video shows it"
+TRACKED_NOTE = "motion of unseen sides: the surface of the known views, tracked through the video"
 FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views
 SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
     update={"across": AssetSettings().across, "whole_depth": 0.02}
@@ -60,7 +60,7 @@ def tracks_surface(settings: MotionSettings, prior: PriorSettings, known: Bank |
 
 
 def tracking_of(known: Bank) -> AssetSettings:
-    """Return how the surface of known views is tracked: where limbs are apart, by optical flow as a user's model is."""
+    """Return the tracking settings for the surface of known views: optical flow if the views surround it."""
     return FLOW if len(known.cameras) >= ALL_AROUND else SOFT
 
 

@@ -17,6 +17,8 @@ KINDS: dict[type[BaseException], FailureKind] = {  # the first match counts: Sto
     MemoryError: "out_of_memory",
 }
 
+MEMORY_SETTINGS = "subject.size, static.views, motion.views or mesh.grid"
+
 
 def failure_kind(error: BaseException) -> FailureKind:
     """Return the contract's kind of failure for an exception."""
@@ -33,7 +35,7 @@ def failure_message(error: BaseException) -> str:
         return "the disk is full: free some space and run the same command again; finished steps are kept"
     if failure_kind(error) == "out_of_memory":
         reason = f" ({error})" if str(error) else ""
-        return f"memory ran out: end other programs, or choose smaller settings{reason}"
+        return f"memory ran out: end other programs, or lower {MEMORY_SETTINGS}{reason}"
     if failure_kind(error) == "crashed":
         frames = traceback.extract_tb(error.__traceback__)
         line = f" (at {Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""

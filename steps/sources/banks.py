@@ -73,7 +73,7 @@ class BankIndex(_Strict):
         rows, columns = self.tile
         width, height = self.sheet_size
         if len(set(self.frames)) < len(self.frames):
-            raise ValueError("frames names a frame twice; every frame may be there once")
+            raise ValueError("frames names a frame twice; every frame may be named once")
         if len(self.frames) > rows * columns:
             raise ValueError(
                 f"frames has {len(self.frames)} entries and tile = [{rows}, {columns}] has room for {rows * columns}; "
@@ -114,7 +114,7 @@ def read_index(path: Path) -> BankIndex:
 
 
 def check_sheet(path: Path, index: BankIndex) -> None:
-    """Refuse a sheet that is no PNG of the size that `bank.json` gives; only the header is read.
+    """Refuse a sheet that is not a PNG of the size that `bank.json` gives; only the header is read.
 
     Raises:
         BadInput: says what it is and what is allowed.
@@ -122,7 +122,7 @@ def check_sheet(path: Path, index: BankIndex) -> None:
     check_still(path)
     with path.open("rb") as file:
         if file.read(len(PNG_SIGNATURE)) != PNG_SIGNATURE:
-            raise BadInput(f"the sheet {path.name} of the bank is no PNG; export it as PNG with alpha")
+            raise BadInput(f"the sheet {path.name} of the bank is not a PNG; export it as PNG with alpha")
     header = read_header(path, ".png")
     if header is None:
         raise BadInput(f"the sheet {path.name} of the bank is cut off or broken; export it again")

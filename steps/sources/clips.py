@@ -109,7 +109,7 @@ class KeptFrames:
         if not len(self.frames):
             self.frames = torch.zeros(len(self._places), *frame.shape)
         if frame.shape != self.frames.shape[1:]:
-            raise BadInput(f"{self._what} changes its size on the way; export it again at one size")
+            raise BadInput(f"{self._what} changes its frame size; export it again at one size")
         self.frames[self._places[index]] = frame
 
 

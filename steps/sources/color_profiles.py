@@ -32,7 +32,7 @@ def convert_to_srgb(picture: Float[Tensor, "h w 4"], profile: bytes) -> tuple[st
         if source.profile.xcolor_space != "RGB ":
             return ()
         transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (OSError, ValueError, ImageCms.PyCMSError):  # the second: names that are no ASCII
+    except (OSError, ValueError, ImageCms.PyCMSError):  # the second: names that are not ASCII
         return (IGNORED,)
     if _is_srgb(transform):
         return ()

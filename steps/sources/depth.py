@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize
-from dg4d_lib.inflation.hints import DepthField, DepthKind, depth_field, layer_field
+from dg4d_lib.inflation.hints import DepthField, DepthKind, depth_field, is_known, known_share, layer_field
 from dg4d_lib.input_settings import SubjectSettings
 from dg4d_lib.video.framing import reframe
 from dg4d_lib.video.subject import PreparedSubject
@@ -21,6 +21,7 @@ from steps.sources.stills import StillValues, read_values
 
 LARGEST_SIDE = 256  # pixels: outlines and depths need no more
 MOST_TINT = 0.02  # mean difference of the color channels of a gray picture: JPEG leaves less
+SPARSE = 0.95  # share of the subject with values, below which the report says it
 ONE_PICTURE = "give one gray picture of the first frame (PNG, TIFF, EXR)"
 
 
@@ -50,15 +51,19 @@ def read_depth(
     if kind == "distance":  # resampled as inverse distance: backgrounds are far away, or at infinity
         known = known & (values > 0)
         values = np.where(known, 1 / np.where(known, values, 1), 0).astype(np.float32)
-    planes, sure = _framed(values, known, prepared)
+    planes, coverage = _framed(values, known, prepared)
     values_there = 1 / planes.clamp(min=1e-12) if kind == "distance" else planes
     alpha = _alpha(prepared, len(planes))
     height, width = prepared.frame
-    field = depth_field(values_there, sure, alpha, kind, max(height, width) / prepared.crop.side)
+    field = depth_field(values_there, coverage, alpha, kind, max(height, width) / prepared.crop.side)
     said = "distances" if kind == "distance" else "relative inverse depth, bright is near"
+    share = known_share(coverage, alpha)
+    if share < SPARSE:
+        said += f", known for {share:.0%} of the subject"
     return (
         field,
-        f"depth: the picture given with --depth ({said}) bends the guess; `subject.depth_kind` reads it otherwise",
+        f"depth: the guessed depth was corrected by the picture of --depth (read as {said}; change with "
+        "subject.depth_kind)",
     )
 
 
@@ -71,9 +76,9 @@ def read_layers(
         BadInput: they cannot be read, are colored, have another size than the source, or say nothing.
     """
     found = _read(path, "the picture of layers", source, prepared, settings, scratch)
-    levels, known = _framed(found.values, found.known, prepared)
-    field = layer_field(levels, known, _alpha(prepared, len(levels)))
-    return field, "depth: the layers given with --layers bring light parts before the rest and dark parts behind it"
+    levels, coverage = _framed(found.values, found.known, prepared)
+    field = layer_field(levels, is_known(coverage), _alpha(prepared, len(levels)))
+    return field, "depth: the guessed depth was corrected by --layers: light parts are nearer, dark parts farther"
 
 
 def _read(
@@ -96,22 +101,22 @@ def _read(
             f"{what} is {given} pixels, the {source.kind} {wanted}; give it at the size of the {source.kind}"
         )
     if found.tint > MOST_TINT:
-        raise BadInput(f"{what} is colored, so its brightness is no depth; save it in gray: {ONE_PICTURE}")
+        raise BadInput(f"{what} is colored, so its brightness is not depth; save it in gray: {ONE_PICTURE}")
     return found
 
 
 def _framed(
     values: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], prepared: PreparedSubject
-) -> tuple[Float[Tensor, "s s"], Bool[Tensor, "s s"]]:
-    """Return values and known pixels in the square of the subject; unknown ones carry no weight."""
+) -> tuple[Float[Tensor, "s s"], Float[Tensor, "s s"]]:
+    """Return averages of the known values in the square of the subject, and the share of every pixel that is known."""
     size = min(LARGEST_SIDE, prepared.frames.shape[1])
     if not known.any():
-        return torch.zeros(size, size), torch.zeros(size, size, dtype=torch.bool)
+        return torch.zeros(size, size), torch.zeros(size, size)
     low, high = float(values[known].min()), float(values[known].max())
     unit = torch.from_numpy((values - low) / max(high - low, 1e-30)).clamp(0, 1)
     picture = torch.cat([unit[..., None].expand(-1, -1, 3), torch.from_numpy(known)[..., None].float()], -1)
     framed = reframe(picture[None], prepared.crop, size)[0]
-    return framed[..., 0] * (high - low) + low, framed[..., 3] > 0.5
+    return framed[..., 0] * (high - low) + low, framed[..., 3]
 
 
 def _alpha(prepared: PreparedSubject, size: int) -> Float[Tensor, "s s"]:

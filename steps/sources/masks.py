@@ -7,8 +7,11 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
+from dg4d_lib.video.framing import VISIBLE
 from dg4d_lib.video.subject import check_box
 from steps.sources.reader import Source, read_source
+
+MOST_TINT = 0.1  # mean difference of the color channels where a mask is painted: JPEG and off-white leave less
 
 
 def read_mask(
@@ -26,7 +29,8 @@ def read_mask(
         max_decode_gb: memory limit in GiB.
 
     Raises:
-        BadInput: the mask cannot be read, or its size or number of frames differs from the source's.
+        BadInput: the mask cannot be read, is colored or almost black, or its size or number of frames differs from the
+            source's.
     """
     try:
         mask = read_source(path, scratch, max_frames, max_decode_gb)
@@ -42,8 +46,29 @@ def read_mask(
         if source.kind == "picture":
             raise BadInput(f"{given}, and the input is one picture; give one picture as the mask")
         raise BadInput(f"{given}, the video {source.count}; give a folder with one mask for every frame")
-    values = mask.frames[..., 3] if mask.has_alpha else mask.frames[..., :3].mean(-1)
+    values = mask.frames[..., 3] if mask.has_alpha else _brightness(mask.frames[..., :3])
+    if 0 < (largest := float(values.max())) <= VISIBLE:
+        raise BadInput(
+            f"--mask is almost black: its largest value is {255 * largest:.2g} of 255, and the subject must be white; "
+            "multiply a mask of labels 0 and 1 by 255"
+        )
     return resize_planes(values[None], source.frames.shape[1:3])[0].clamp(0, 1)
+
+
+def _brightness(colors: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w"]:
+    """Return the brightness of gray frames.
+
+    Raises:
+        BadInput: they are colored.
+    """
+    painted = colors[colors.amax(-1) > VISIBLE]
+    tint = float((painted.amax(-1) - painted.amin(-1)).mean()) if len(painted) else 0.0
+    if tint > MOST_TINT:
+        raise BadInput(
+            "--mask is colored, so its brightness is not the opacity of the subject; paint the subject white and the "
+            "background black, or give a picture whose alpha channel is the mask"
+        )
+    return colors.mean(-1)
 
 
 def scaled_box(box: tuple[int, ...], source: Source) -> tuple[int, ...]:

@@ -156,7 +156,7 @@ def check_no_scene(names: Iterable[str]) -> None:
     """
     scene = next((name for name in names if Path(name).suffix.lower() in SCENE_SUFFIXES), None)
     if scene is not None:
-        raise BadInput(f"the zip is a 3D scene (USDZ, it holds {scene!r}), which is no source; give {ALLOWED}")
+        raise BadInput(f"the zip is a 3D scene (USDZ, it holds {scene!r}), which is not a source; give {ALLOWED}")
 
 
 def frame_suffix(name: str, head: bytes) -> str:
@@ -198,7 +198,7 @@ def check_media(path: Path) -> None:
 
 
 def check_still(path: Path) -> None:
-    """Refuse a file that is no picture.
+    """Refuse a file that is not a picture.
 
     Raises:
         BadInput: says what it is and what to give.
@@ -210,7 +210,7 @@ def check_still(path: Path) -> None:
 
 
 def check_arrays(path: Path) -> None:
-    """Refuse a file that is no NumPy archive.
+    """Refuse a file that is not a NumPy archive.
 
     Raises:
         BadInput: says so.
@@ -219,9 +219,9 @@ def check_arrays(path: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             foreign = [info.filename for info in archive.infolist() if not _begins(archive, info, NPY)]
     except UNREADABLE as error:
-        raise BadInput(f"{path} is no NumPy archive (.npz): {error}") from error
+        raise BadInput(f"{path} is not a NumPy archive (.npz): {error}") from error
     if foreign:
-        raise BadInput(f"{path} is no NumPy archive (.npz): {foreign[0]} is no array")
+        raise BadInput(f"{path} is not a NumPy archive (.npz): {foreign[0]} is not an array")
 
 
 def _check_zip(path: Path) -> None:
@@ -234,7 +234,7 @@ def _check_zip(path: Path) -> None:
             check_no_scene(info.filename for info in entries)
             for info in entries:
                 if not is_frame_name(info.filename):
-                    raise BadInput(f"the zip holds {info.filename!r}, which is no frame; pack the pictures alone")
+                    raise BadInput(f"the zip holds {info.filename!r}, which is not a frame; pack the pictures alone")
                 with archive.open(info) as file:
                     frame_suffix(info.filename, file.read(SNIFFED_BYTES))
     except UNREADABLE as error:

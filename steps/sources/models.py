@@ -99,7 +99,7 @@ def _merged(own: OwnModel, most: int) -> OwnModel:
     """Return the model with at most so many splats."""
     if own.splats is None or len(own.splats) <= most:
         return own
-    note = f"{len(own.splats)} splats were merged to {most}, which look alike (asset.max_splats)"
+    note = f"{len(own.splats)} splats were merged to {most} that look the same (asset.max_splats)"
     return replace(own, splats=merge_gaussians(own.splats, most), notes=(*own.notes, note))
 
 
@@ -142,7 +142,7 @@ def embed_files(file: Path) -> bytes:
         tree, binary = _chunks(content) if is_glb else (_tree(content), b"")
     except (ValueError, struct.error, RecursionError) as error:
         kind = "GLB" if is_glb else "glTF"
-        raise BadInput(f"the model is no {kind} 2.0 ({error}); export it again as GLB") from error
+        raise BadInput(f"the model is not a {kind} 2.0 file ({error}); export it again as GLB") from error
     try:
         return _embedded(tree, binary, file.parent)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
@@ -203,7 +203,7 @@ def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
 def _tree(text: bytes) -> dict[str, Any]:
     tree = json.loads(text)
     if not isinstance(tree, dict):
-        raise ValueError("its JSON is no object")
+        raise ValueError("its JSON is not an object")
     return tree
 
 

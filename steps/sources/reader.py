@@ -147,7 +147,7 @@ def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) 
     _need_two(clip.count, "the video")
     frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
     lost = clip.announced - clip.count
-    notes = (f"The video promises {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
+    notes = (f"The video declares {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
     return _video(frames, has_alpha, clip.fps, clip.count, clip.size, (*notes, *clip.notes))
 
 

@@ -121,7 +121,7 @@ def parse_view(text: str) -> tuple[float, float, str]:
             raise ValueError
     except ValueError:
         raise BadInput(
-            f"{quoted(text)} is no view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
+            f"{quoted(text)} is not a view: write AZIMUTH[,ELEVATION]=FILE in degrees, for example 90=right.png"
         ) from None
     azimuth, elevation = (*numbers, 0.0)[:2]
     check_direction(azimuth, elevation, text)
@@ -175,7 +175,7 @@ class _Loose(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
-Bounded = Annotated[float, Field(ge=-1e6, le=1e6)]  # larger ones are no places, and overflow when squared
+Bounded = Annotated[float, Field(ge=-1e6, le=1e6)]  # larger ones are not places, and overflow when squared
 Row = tuple[Bounded, Bounded, Bounded, Bounded]
 
 
@@ -257,6 +257,6 @@ def read_transforms(path: Path) -> Transforms:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from error
     except ValidationError as error:
         raise BadInput(
-            f"{path} is no transforms.json of nerfstudio (frames with file_path and transform_matrix): "
+            f"{path} is not a transforms.json of nerfstudio (frames with file_path and transform_matrix): "
             f"{settings_errors(error)}"
         ) from error

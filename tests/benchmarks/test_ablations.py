@@ -169,7 +169,7 @@ def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsy
         (["noise", f"--data={dataset}", "--objects", "cat"], "unknown objects cat; choose from balls, picture"),
         (["static", "--objects", "cat"], "unknown objects cat; choose from newt, parrot, jellyfish, excavator"),
         (["static", "noise", f"--data={dataset}"], "noise: needs videos; picture has one frame only"),
-        (["static", f"--data={dataset / 'nowhere'}"], "is no data set"),
+        (["static", f"--data={dataset / 'nowhere'}"], "is not a data set"),
         (["static", "--seeds", "0"], "--seeds is 0; give at least 1"),
         (["static", "--frames", "0"], "--frames is 0; give at least 1"),
         (["static", "--size=-3"], "--size is -3; give at least 1"),

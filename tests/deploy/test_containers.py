@@ -1,6 +1,7 @@
 """The images: linted, complete, and steps that give in a container what they give elsewhere."""
 
 import fnmatch
+import itertools
 import json
 import os
 import re
@@ -151,6 +152,53 @@ def test_a_base_image_is_made_of_what_debootstrap_made_and_leaves_nothing_behind
     assert (tmp_path / "asked").read_text().split()[-1] == "dg4d/python"
     assert {"./usr/bin/python", "./usr/bin/python3"} <= set((tmp_path / "given").read_text().split())
     assert list(scratch.iterdir()) == []
+
+
+def build(folder: Path, *arguments: str) -> tuple[int, str, list[list[str]]]:
+    """Build with a stand-in for docker; return the exit status, the errors and the arguments of every call."""
+    (folder / "asked").touch()
+    (folder / "docker").write_text(f'#!/bin/sh\necho "$@" >> {folder}/asked\n')
+    (folder / "docker").chmod(0o755)
+    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "DG4D_ENGINE": "docker"}
+    command = [ROOT / "deploy" / "containers.sh", "build", *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr, [line.split() for line in (folder / "asked").read_text().splitlines()]
+
+
+def after(call: list[str], option: str) -> list[str]:
+    return [value for name, value in itertools.pairwise(call) if name == option]
+
+
+@pytest.mark.parametrize(
+    ("names", "tags"),
+    [
+        ((), ["dg4d/cpu", "dg4d/flows"]),
+        (("cuda", "flows-cuda"), ["dg4d/cuda", "dg4d/flows:cuda"]),
+        (("cpu", "flows", "cuda", "flows-cuda"), ["dg4d/cpu", "dg4d/flows", "dg4d/cuda", "dg4d/flows:cuda"]),
+    ],
+)
+def test_every_image_is_built_under_one_name_of_its_own(
+    names: tuple[str, ...], tags: list[str], tmp_path: Path
+) -> None:
+    status, errors, calls = build(tmp_path, *names, "--", "--build-arg", "PYTHON=dg4d/python")
+    assert (status, errors) == (0, "")
+    assert [after(call, "--tag") for call in calls] == [[tag] for tag in tags]
+    assert all((ROOT / file).is_file() for call in calls for file in after(call, "--file"))
+    used = {"dg4d/flows:cuda": ["STEPS=dg4d/cuda", "PYTHON=dg4d/python"]}
+    assert [after(call, "--build-arg") for call in calls] == [used.get(tag, ["PYTHON=dg4d/python"]) for tag in tags]
+
+
+def test_an_image_that_cannot_be_built_is_refused_with_the_names_of_those_that_can(tmp_path: Path) -> None:
+    status, errors, calls = build(tmp_path, "gpu")
+    assert (status, calls) == (2, [])
+    assert errors == "There is no image gpu; use cpu, cuda, flows or flows-cuda.\n"
+
+
+def test_every_image_that_services_and_pools_use_can_be_built(tmp_path: Path) -> None:
+    files = [*(ROOT / "deploy").glob("*.yaml"), *(ROOT / "deploy" / "k8s").glob("*.yaml")]
+    used = {image for file in files for image in re.findall(r"\bimage: (dg4d/\S+)", file.read_text())}
+    _, _, calls = build(tmp_path, "cpu", "cuda", "flows", "flows-cuda")
+    assert used and used <= {tag for call in calls for tag in after(call, "--tag")}
 
 
 def health_check(path: Path) -> list[str]:

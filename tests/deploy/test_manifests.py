@@ -13,6 +13,8 @@ from compose_spec import PyCompose
 from yamllint import linter
 from yamllint.config import YamlLintConfig
 
+from flows.serving.server import LOGIN
+
 DEPLOY = Path(__file__).parents[2] / "deploy"
 FILES = sorted(DEPLOY.rglob("*.yaml"))
 COMPOSE: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text(encoding="utf-8"))
@@ -88,6 +90,21 @@ def test_every_foreign_image_is_pinned_by_digest_and_its_version_is_told() -> No
         name, _, digest = image.partition("@")
         assert re.fullmatch(r"sha256:[0-9a-f]{64}", digest)
         assert re.fullmatch(rf"# {re.escape(name)}:[\w.-]*\d[\w.-]*", comment)
+
+
+@pytest.mark.parametrize("file", ["deploy/compose.yaml", "deploy/k8s/kustomization.yaml", "docs/deployment.md"])
+def test_the_address_that_signs_in_and_its_secret_are_told(file: str) -> None:
+    text = (DEPLOY.parent / file).read_text(encoding="utf-8")
+    assert f"http://127.0.0.1:4200{LOGIN}#NAME:PASSWORD" in text
+    assert "DG4D_API_AUTH" in text or "PREFECT_API_AUTH_STRING" in text
+
+
+def test_an_image_of_ours_that_is_there_is_not_pulled() -> None:
+    containers = [container for pod in PODS.values() for container in pod["spec"]["containers"]]
+    ours = [container for container in containers if container["image"].startswith("dg4d/")]
+    assert len(ours) == 4 and all(container["imagePullPolicy"] == "IfNotPresent" for container in ours)
+    services = [service for service in SERVICES.values() if service["image"].startswith("dg4d/")]
+    assert len(services) == 5 and all(service["pull_policy"] == "never" for service in services)
 
 
 @pytest.mark.parametrize("name", LASTING)

@@ -1,7 +1,7 @@
 """Pools and deployments: what a worker makes of them, and mistakes that a server would take without a word."""
 
 import re
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import kubernetes_validate
@@ -14,7 +14,9 @@ from prefect.utilities.schema_tools.validation import validate
 
 import flows
 from dg4d_lib.errors import BadInput
+from flows.engine.resources import CORES_PER_STEP
 from flows.serving.pools import DEPLOYMENTS, Pool, read_deployments, read_pools
+from flows.studio.submission import GPU
 
 POOLS = read_pools()
 KUBERNETES = "1.33"
@@ -49,6 +51,12 @@ def test_a_deployment_is_known_by_its_name_alone_and_a_flow_by_its_function() ->
         flow = load_flow_from_entrypoint(deployment["entrypoint"])
         assert flow.name == deployment["entrypoint"].rpartition(".")[2].replace("_", "-")
         assert deployment["tags"] == [flow.name.removesuffix("-to-4d")]
+
+
+def test_the_studio_starts_runs_of_the_pools_of_processes() -> None:
+    pool = {one["name"]: one["work_pool"]["name"] for one in read_deployments()}
+    for title in ("Picture", "Video", "Model", "Catalog"):
+        assert pool[f"{title} to 4D"] == "process-cpu" and pool[f"{title} to 4D{GPU}"] == "process-gpu"
 
 
 def test_no_two_flows_have_one_name() -> None:
@@ -119,6 +127,22 @@ def test_a_job_is_valid_confined_and_limited(pool: Pool) -> None:
     environment = {entry["name"]: entry.get("value") for entry in container["env"]}
     assert environment["PREFECT_HOME"] == "/tmp/prefect" and environment["DG4D_HOME"] == "/data/home"
     assert manifest["spec"]["backoffLimit"] == 0  # Prefect counts attempts
+
+
+@pytest.mark.parametrize("pool", pools_of("kubernetes"))
+def test_the_slots_of_a_job_are_its_own_and_fit_its_cpus(pool: Pool) -> None:
+    container = job_container(pool)
+    environment = {entry["name"]: entry.get("value") for entry in container["env"]}
+    mounted = [PurePosixPath(mount["mountPath"]) for mount in container["volumeMounts"]]
+    slots = PurePosixPath(environment["DG4D_SLOTS"])
+    assert slots.is_absolute() and mounted and not any(slots.is_relative_to(place) for place in mounted)
+    assert int(environment["DG4D_CPUS"]) == int(container["resources"]["limits"]["cpu"]) // CORES_PER_STEP
+
+
+@pytest.mark.parametrize("pool", pools_of("docker"))
+def test_containers_of_one_machine_share_its_slots_and_pull_no_image(pool: Pool) -> None:
+    assert "DG4D_SLOTS" not in rendering.container(pool)["environment"]
+    assert pool.variables["image_pull_policy"] == "Never"
 
 
 def job_container(pool: Pool) -> dict[str, Any]:

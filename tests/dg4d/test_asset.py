@@ -2,11 +2,14 @@
 
 import html
 import json
+import math
 import re
 import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,6 +95,44 @@ def test_a_rendering_is_a_picture_with_alpha(gem: Path, mesh: bool) -> None:
     assert picture[inside][:, 2].mean() > picture[inside][:, 0].mean()  # blue
 
 
+@pytest.fixture
+def undrawn(gem: Path) -> Asset:
+    """An asset that must not be rendered: pictures without pixels end the process."""
+
+    def draw(*_: object) -> None:
+        raise AssertionError("rendered")
+
+    asset = dg4d.load(gem)
+    vars(asset).update(_draw_gaussians=draw, _draw_mesh=draw)
+    return asset
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 0}, {"height": -5}, {"fov_y_deg": 0.0}, {"fov_y_deg": 180.0}, {"fov_y_deg": math.nan},
+        {"radius": -2.0}, {"radius": math.inf}, {"azimuth_deg": math.nan}, {"elevation_deg": math.inf},
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("mesh", [False, True])
+def test_a_camera_out_of_range_is_refused_before_rendering(undrawn: Asset, wrong: dict[str, Any], mesh: bool) -> None:
+    with pytest.raises(BadInput, match="given"):
+        undrawn.render(dg4d.Camera(**wrong), mesh=mesh)
+
+
+@pytest.mark.parametrize(("width", "height"), [(4097, 4), (4, 4097), (32.5, 4), (0, 4)])
+def test_a_picture_that_is_too_large_or_has_parts_of_pixels_is_refused(undrawn: Asset, width: Any, height: int) -> None:
+    camera: Any = SimpleNamespace(width=width, height=height)  # the type checker of the tests refuses such a camera
+    with pytest.raises(BadInput, match=rf"{width} x {height} pixels; .* whole numbers from 1 to 4096"):
+        undrawn.render(camera)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_a_picture_of_one_pixel_is_rendered(gem: Path, mesh: bool) -> None:
+    camera = dg4d.Camera(width=1, height=1, fov_y_deg=5)
+    assert dg4d.load(gem).render(camera, mesh=mesh).shape == (1, 1, 4)
+
+
 def test_an_unknown_time_is_refused(gem: Path) -> None:
     with pytest.raises(BadInput, match="seconds"):
         dg4d.load(gem).mesh(float("nan"))
@@ -115,6 +156,54 @@ def test_a_zip_loads_without_and_with_a_record(gem: Path, tmp_path: Path) -> Non
         folder = asset.folder
         del asset
         assert not folder.exists()
+
+
+def zipped(folder: Path, path: Path, below: str) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                archive.write(file, below + file.relative_to(folder).as_posix())
+    return path
+
+
+@pytest.mark.parametrize("beside", ["", "README.txt", "__MACOSX/gem/._asset.json"])
+def test_a_zip_of_the_folder_itself_loads(gem: Path, tmp_path: Path, beside: str) -> None:
+    path = zipped(gem, tmp_path / "z.zip", "gem/")
+    if beside:
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(beside, "x")
+    asset = dg4d.load(path)
+    assert asset.name == "gem <&> stone" and asset.mesh().faces.size and "<iframe" in asset._repr_html_()
+    folder = asset.folder
+    del asset
+    assert not folder.exists() and not folder.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["a.txt"], r"z\.zip is not an asset: it has no asset\.json"),
+        (["a/asset.json", "b/asset.json"], r"z\.zip is not an asset: it has no asset\.json"),
+        (["a/asset.json"], r"z\.zip/a/asset\.json cannot be used"),
+    ],
+)
+def test_a_zip_that_is_not_an_asset_is_refused_by_its_name(tmp_path: Path, names: list[str], says: str) -> None:
+    path = tmp_path / "z.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in names:
+            archive.writestr(name, "x")
+    with pytest.raises(BadInput, match=says) as refused:
+        dg4d.load(path)
+    assert str(refused.value).startswith(str(path)) and "dg4d-asset-" not in str(refused.value)
+
+
+def test_a_damaged_zip_is_refused_by_its_name(gem: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "gem"
+    shutil.copytree(gem, folder)
+    (folder / "asset.glb").write_bytes(b"other")
+    with pytest.raises(BadInput, match=r"z\.zip/gem is damaged: asset\.glb was altered") as refused:
+        dg4d.load(zipped(folder, tmp_path / "z.zip", "gem/"))
+    assert "dg4d-asset-" not in str(refused.value)
 
 
 def test_the_report_is_read_and_a_broken_one_refused(gem: Path, tmp_path: Path) -> None:
@@ -164,7 +253,7 @@ def test_a_package_that_was_altered_or_is_none_is_refused(gem: Path, tmp_path: P
     with pytest.raises(BadInput, match="does not exist"):
         dg4d.load(tmp_path / "nothing")
     (tmp_path / "text.zip").write_text("no zip")
-    with pytest.raises(BadInput, match="no zip"):
+    with pytest.raises(BadInput, match="not a zip"):
         dg4d.load(tmp_path / "text.zip")
 
 

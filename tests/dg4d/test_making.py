@@ -5,8 +5,9 @@ import json
 import math
 import os
 import threading
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import dg4d
 from dg4d import making, progress
 from dg4d.asset import Asset
 from dg4d_lib.errors import BadInput
+from flows import home
 from flows.step_errors import StepBadInput
 
 
@@ -86,7 +88,18 @@ def test_settings_are_nested_or_dotted(settings: dict[str, Any]) -> None:
         ({"views": {(90, 89): "fox.png"}}, "out of range"),
         ({"views": {math.nan: "fox.png"}}, "out of range"),
         ({"views": {90: "none.png"}}, "none.png"),
-        ({"views": ["fox.png"]}, 'views is a dict of azimuth to file, for example {90: "right.png"}; given list'),
+        ({"views": ["fox.png"]}, 'views is a dict of azimuth to picture, for example {90: "right.png"}; given list'),
+        ({"views": {"90": "fox.png"}}, """views has the direction '90'.*for example {90: "right.png"}"""),
+        ({"views": {(90, 0, 0): "fox.png"}}, r"views has the direction \(90, 0, 0\)"),
+        ({"views": {(90, "0"): "fox.png"}}, "views has the direction"),
+        ({"views": {90: 5}}, "a view is a path, a PIL image or an array.*given int"),
+        ({"views": {90: np.zeros((4, 4, 3), np.uint16)}}, "a view is .*type uint16"),
+        ({"mask": 5}, "a mask is a path, a PIL image or an array.*given int"),
+        ({"mask": np.zeros(4, bool)}, r"a mask is .*\(height, width\).*given ndarray of shape \(4,\)"),
+        ({"depth": np.zeros((4, 4))}, "depth is a path; given ndarray"),
+        ({"turntable": 5}, "turntable is a path; given int"),
+        ({"video": [1]}, "video is a path; given list"),
+        ({"out": 5}, "out is a path; given int"),
         ({"views": {(90, 0): "fox.png", 90: "fox.png"}}, "90"),
         ({"asset": "none.glb"}, "none.glb"),
         ({"asset": "fox.glb", "views": {180: "fox.png"}}, "not both"),
@@ -99,6 +112,12 @@ def test_wrong_arguments_are_refused_before_any_work(alone: Path, call: dict[str
     with pytest.raises(BadInput, match=says):
         dg4d.make(words("fox.png", "x"), **call)
     assert ran(alone) == [] and not Path("out").exists()
+
+
+def test_a_text_of_another_type_is_refused() -> None:
+    for text in (5, b"a fox", ["fox"]):
+        with pytest.raises(BadInput, match="text"):
+            dg4d.make(text=text)
 
 
 def test_nothing_to_make_and_another_asset_in_the_way_are_refused() -> None:
@@ -128,14 +147,84 @@ def test_a_picture_in_memory_is_taken(given: Any, monkeypatch: pytest.MonkeyPatc
     assert (job.item, folder) == ("drawn", Path("out/drawn"))
 
 
-def written_size(given: Image.Image, folder: Path) -> tuple[int, int]:
-    with Image.open(making._written(given, folder, "x")) as found:
-        return found.size
+def written(given: Any, folder: Path, what: Literal["picture", "mask"] = "picture") -> Image.Image:
+    with Image.open(making._written(given, folder, "x", what)) as found:
+        found.load()
+        return found
 
 
-@pytest.mark.parametrize("mode", ["L", "CMYK", "YCbCr", "LAB", "F", "I", "I;16", "RGBa", "RGBX", "P", "1"])
+@pytest.mark.parametrize(
+    "mode", ["L", "CMYK", "YCbCr", "LAB", "HSV", "I;16", "I;16B", "RGBa", "RGBX", "LA", "La", "P", "PA", "1"]
+)
 def test_pictures_of_every_mode_are_written(mode: str, tmp_path: Path) -> None:
-    assert written_size(Image.new(mode, (6, 4)), tmp_path) == (6, 4)
+    assert written(Image.new(mode, (6, 4)), tmp_path).size == (6, 4)
+
+
+@pytest.mark.parametrize("mode", ["I;16", "I;16B"])
+def test_pictures_of_16_bits_keep_their_values(mode: str, tmp_path: Path) -> None:
+    assert written(Image.new(mode, (6, 4), 3000), tmp_path).getpixel((0, 0)) == 3000
+
+
+@pytest.mark.parametrize("mode", ["I", "F"])
+def test_pictures_without_a_range_of_values_are_refused(mode: str) -> None:
+    with pytest.raises(BadInput, match=f"mode '{mode}'.*scale its values to 0 to 255.*I;16, .*CMYK"):
+        dg4d.make(Image.new(mode, (40, 40), 100))
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (np.nan, "given NaN; replace"),
+        (np.inf, "given values from 0 to inf; divide by 255"),
+        (200.0, "given values from 0 to 200; divide by 255"),
+        (1.01, "from 0 to 1.01"),
+        (-0.5, "from -0.5 to 0"),
+    ],
+)
+def test_floats_out_of_range_are_refused(value: float, says: str) -> None:
+    given = np.zeros((40, 40, 3), np.float32)
+    given[3, 4] = value
+    for pixels in (given, np.full_like(given, value)) if math.isnan(value) else (given,):
+        with pytest.raises(BadInput, match=rf"floats in \[0, 1\].*{says}"):
+            dg4d.make(pixels)
+
+
+def test_floats_are_written_as_8_bits_also_with_rounding_errors(tmp_path: Path) -> None:
+    for value, expected in ((1 + 1e-6, 255), (-1e-6, 0), (0.5, 128), (1.0, 255)):
+        assert written(np.full((4, 4, 3), value), tmp_path).getpixel((0, 0)) == (expected,) * 3
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.eye(40, dtype=bool), 255 * np.eye(40, dtype=np.uint8), np.eye(40),
+        Image.fromarray(255 * np.eye(40, dtype=np.uint8)),
+        np.stack([255 * np.eye(40, dtype=np.uint8)] * 3, -1),
+    ],
+    ids=["bool", "uint8", "float", "PIL", "channels"],
+)  # fmt: skip
+def test_a_mask_in_memory_is_white_where_it_is_set(given: Any, tmp_path: Path) -> None:
+    found = np.asarray(written(given, tmp_path, "mask").convert("L"))
+    np.testing.assert_array_equal(found, 255 * np.eye(40, dtype=np.uint8))
+
+
+def test_mask_and_views_in_memory_are_those_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs: list[Any] = []
+    monkeypatch.setattr(making, "_run", lambda job, folder, engine, force: jobs.append(job))
+    monkeypatch.setattr(making, "load", lambda folder: folder)
+    picture, side, mask = Image.new("RGB", (40, 40), "red"), Image.new("RGB", (40, 40), "blue"), np.eye(40) > 0
+    Image.fromarray(mask).convert("L").save("mask.png")
+    for number in range(2):
+        views = {90: side, (180.0, 10): np.asarray(picture), np.float32(-90): words("left.png", "x")}
+        dg4d.make(picture, mask=mask, views=views, out=str(number))
+    dg4d.make(picture, mask="mask.png", out="other")
+    assert jobs[0] == jobs[1]  # names of temporary files do not count
+    with Image.open(home.store().path(jobs[0].mask)) as one, Image.open("mask.png") as other:
+        np.testing.assert_array_equal(np.asarray(one.convert("L")), np.asarray(other))
+    with zipfile.ZipFile(home.store().path(jobs[0].views)) as archive:
+        given = json.loads(archive.read("views.json"))["views"]
+    assert [(one["azimuth"], one["elevation"]) for one in given] == [(90, 0), (180, 10), (-90, 0)]
+    assert [one["name"] for one in given] == ["view-1.png", "view-2.png", "left.png"]
 
 
 def test_a_picture_in_memory_is_turned_upright(tmp_path: Path) -> None:
@@ -143,7 +232,7 @@ def test_a_picture_in_memory_is_turned_upright(tmp_path: Path) -> None:
     exif[0x0112] = 6  # orientation
     Image.new("RGB", (8, 4)).save(tmp_path / "phone.jpg", exif=exif)
     with Image.open(tmp_path / "phone.jpg") as phone:
-        assert written_size(phone, tmp_path) == (4, 8)
+        assert written(phone, tmp_path).size == (4, 8)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +247,7 @@ def test_a_picture_in_memory_is_turned_upright(tmp_path: Path) -> None:
     ],
 )
 def test_other_things_in_memory_are_refused(given: Any) -> None:
-    with pytest.raises(BadInput, match="PIL image or an array"):
+    with pytest.raises(BadInput, match="a picture is a path, a PIL image or an array"):
         dg4d.make(given)
 
 

@@ -84,7 +84,7 @@ def test_a_picture_becomes_a_package_and_a_second_run_does_nothing(dg4d: Command
     assert read_png(out / "contact_sheet.png").std() > 0.05
     assert (out / "preview.mp4").stat().st_size > 1000
     report = json.loads((out / "report.json").read_text())
-    assert "shape network trained on made-up shapes" in json.dumps(report)
+    assert "shape network trained on synthetic shapes" in json.dumps(report)
     records = json.loads((out / "provenance.json").read_text())
     for step in ("prepare_subject", "drive_video", "fit_gaussians", "fit_motion", "extract_mesh", "pack_asset"):
         assert step in json.dumps(records)

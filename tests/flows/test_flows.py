@@ -156,7 +156,7 @@ def test_two_runs_into_one_folder_take_turns_and_the_second_finds_it_done(log: P
     assert [command.returncode for command in both] == [0, 0]
     assert sorted(ran(log)) == sorted(EVERY_STEP)
     assert sum("waiting for another run" in text for text in said) == 1
-    assert sum("no step to do" in text for text in said) == 1
+    assert sum("no step was run" in text for text in said) == 1
     load_verified(tmp_path / "out")
 
 
@@ -194,7 +194,7 @@ def test_a_command_with_nothing_to_do_says_so(dg4d: Run, log: Path, tmp_path: Pa
     assert "nothing to do" not in dg4d("make", "x.png").output
     ran(log)
     before = tree(tmp_path / "out" / "x")
-    says = {"out/x": "nothing to do: every step was already done", "out/y": "no step to do: the package was written"}
+    says = {"out/x": "nothing to do: every step was already done", "out/y": "no step was run: the package was written"}
     for out, line in says.items():
         done = dg4d("make", "x.png", "-o", out)
         assert done.exit_code == 0

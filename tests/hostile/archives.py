@@ -131,7 +131,7 @@ ZIPS: dict[str, Make] = {
     "zip: deflate garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=8),
     "zip: bzip2 garbage": lambda: named([(b"0.png", b"\xff" * 99), (b"1.png", b"\xff" * 99)], method=12),
     "zip: an entry without a name": lambda: named([(b"", b"x"), (b"0.png", frame(0)), (b"1.png", b"")]),
-    "zip: names that are no UTF-8": lambda: named(
+    "zip: names that are not UTF-8": lambda: named(
         [(b"\xff\xfe0.png", frame(0)), (b"\xff\xfe1.png", frame(1))], flags=0x800
     ),
     "zip: entries that claim 4 GB": lambda: named([(b"0.png", frame(0)), (b"1.png", frame(1))], claimed=2**32 - 2),

@@ -127,7 +127,7 @@ FOLDERS: dict[str, Place] = {
     "bank: a view of the root": bank(about(views=[view(file="/etc/passwd")])),
     "bank: a view that is a number": bank(about(views=[view(file=7)])),
     "bank: a view that is not there": bank(about(views=[view(file="gone.png")])),
-    "bank: an azimuth that is no number": bank(json.dumps(about(views=[view(azimuth=float("nan"))])).encode()),
+    "bank: an azimuth that is not a number": bank(json.dumps(about(views=[view(azimuth=float("nan"))])).encode()),
     "bank: an azimuth in words": bank(about(views=[view(azimuth="left")])),
     "bank: a radius of nothing": bank(about(views=[view(radius=0)])),
     "bank: a sheet of text": bank(files={"view.png": b"no picture"}),

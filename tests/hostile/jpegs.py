@@ -86,7 +86,7 @@ JPEGS: dict[str, Make] = {
     "jpeg: EXIF that points to itself": lambda: _with_segment(
         sound_jpeg(), 0xE1, b"Exif\0\0II*\0\x08\0\0\0\x01\0\x69\x87\x04\0\x01\0\0\0\x08\0\0\0\x08\0\0\0"
     ),
-    "jpeg: thumbnail that is no picture": lambda: _with_segment(sound_jpeg(), 0xE0, b"JFXX\0\x10" + bytes(40)),
+    "jpeg: thumbnail that is not a picture": lambda: _with_segment(sound_jpeg(), 0xE0, b"JFXX\0\x10" + bytes(40)),
     "jpeg: CMYK": lambda: saved(subject("CMYK"), "JPEG", quality=95),
     "jpeg: gray": lambda: saved(subject("L"), "JPEG"),
     "jpeg: progressive": lambda: saved(subject(), "JPEG", progressive=True),

@@ -1,4 +1,4 @@
-"""Command lines with mistakes, and what is given to options that is no value of theirs.
+"""Command lines with mistakes, and values that options do not allow.
 
 They run in a folder with `cat.png` (a sound picture), `run.mp4` (a sound video), `pets/` (with a picture), `bank/` (a
 sound bank), `thesis/` (with a file of the user's) and `broken.json` (no JSON).
@@ -53,7 +53,7 @@ OPTIONS: dict[str, list[str]] = {
     "make: a depth that is gone": ["make", "cat.png", "--depth", "gone.png"],
     "make: a depth that is a video": ["make", "cat.png", "--depth", "run.mp4"],
     "make: layers that are a folder": ["make", "cat.png", "--layers", "pets"],
-    "make: layers that are no picture": ["make", "cat.png", "--layers", "broken.json"],
+    "make: layers that are not a picture": ["make", "cat.png", "--layers", "broken.json"],
     "make: depth and layers": ["make", "cat.png", "--depth", "cat.png", "--layers", "cat.png"],
     "make: depth and a view": ["make", "cat.png", "--depth", "cat.png", "--view", "180=cat.png"],
     "make: depth and a model": ["make", "cat.png", "--depth", "cat.png", "--asset", "cube.glb"],

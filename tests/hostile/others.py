@@ -1,4 +1,4 @@
-"""Files that are neither pictures nor videos, and places that are no files."""
+"""Files that are neither pictures nor videos, and places that are not files."""
 
 import gzip
 import io

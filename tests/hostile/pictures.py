@@ -183,7 +183,7 @@ PNGS: dict[str, Make] = {
     "png: no pixels": lambda: png(ihdr()),
     "png: pixels before the header": lambda: png(_rows(), ihdr()),
     "png: two headers": lambda: png(ihdr(), ihdr(32, 32), _rows()),
-    "png: pixels are no zlib": lambda: png(ihdr(), chunk(b"IDAT", bytes(range(256)))),
+    "png: pixels are not zlib": lambda: png(ihdr(), chunk(b"IDAT", bytes(range(256)))),
     "png: too few pixels": lambda: png(ihdr(), chunk(b"IDAT", zlib.compress(gray_rows()[:100]))),
     "png: chunk of two billion bytes": lambda: png(ihdr(), chunk(b"IDAT", b"x", length=HUGE)),
     "png: chunk of four billion bytes": lambda: png(ihdr(), chunk(b"IDAT", b"x", length=2**32 - 1)),

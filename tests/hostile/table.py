@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from tests.hostile.outcomes import Refused
 
-# Places that are no files, and folders: what a command says before a byte is stored.
+# Places that are not files, and folders: what a command says before a byte is stored.
 PLACES: dict[str, Refused] = {
     "place: nothing there": Refused("does not exist"),
     "place: a folder": Refused("is a folder"),
@@ -21,7 +21,7 @@ PLACES: dict[str, Refused] = {
 }
 
 UNPACKED: dict[str, int | Refused] = {
-    "unpack: no zip": Refused("no zip"),
+    "unpack: no zip": Refused("not a zip"),
     "unpack: a link out": Refused("link"),
     "unpack: a link, and a file through it": Refused("link"),
     "unpack: above the folder": Refused("outside itself"),
@@ -82,7 +82,7 @@ BANKS: dict[str, int | Refused] = {
     "bank: a view of the root": Refused("outside"),
     "bank: a view that is a number": Refused("7|file|bank"),
     "bank: a view that is not there": Refused("gone.png"),
-    "bank: an azimuth that is no number": Refused("azimuth|bank"),
+    "bank: an azimuth that is not a number": Refused("azimuth|bank"),
     "bank: an azimuth in words": Refused("azimuth|bank"),
     "bank: a radius of nothing": Refused("radius|bank"),
     "bank: a sheet of text": Refused("view.png|picture"),
@@ -134,26 +134,26 @@ COMMANDS: dict[str, Refused] = {
     "make: pick 17": Refused("--pick", USAGE),
     "make: pick with a video": Refused("--pick"),
     "make: a bank without the oracle": Refused("prior.kind=oracle"),
-    "make: a view without an azimuth": Refused("is no view"),
+    "make: a view without an azimuth": Refused("is not a view"),
     "make: a view from above": Refused("elevation 90 is out of range"),
     "make: a view that is gone": Refused("gone.png does not exist"),
     "make: two views of one direction": Refused("views of one direction"),
     "make: a turntable that is gone": Refused("gone.mp4 does not exist"),
     "make: a model that is gone": Refused("gone.glb does not exist"),
-    "make: a model that is a picture": Refused("is none of .glb"),
+    "make: a model that is a picture": Refused("unsupported format"),
     "make: a model and a view": Refused("give the model, or the pictures, not both"),
     "make: a model and a turntable": Refused("give the model, or the pictures, not both"),
     "make: a model alone with a mask": Refused("--asset is given alone"),
     "make: a depth that is gone": Refused("--depth: gone.png does not exist"),
-    "make: a depth that is a video": Refused("--depth: run.mp4 is no picture"),
+    "make: a depth that is a video": Refused("--depth: run.mp4 is not a picture"),
     "make: layers that are a folder": Refused("--layers: pets is a folder"),
-    "make: layers that are no picture": Refused("--layers: broken.json"),
+    "make: layers that are not a picture": Refused("--layers: broken.json"),
     "make: depth and layers": Refused("--depth and --layers cannot be combined"),
     "make: depth and a view": Refused("--depth cannot be combined with --view, --turntable or --cameras"),
     "make: depth and a model": Refused("--depth cannot be combined with --asset"),
     "make: depth of words": Refused("--text has none"),
     "make: depth of two pictures": Refused("--depth makes one asset"),
-    "make: cameras that are a picture": Refused("no transforms.json"),
+    "make: cameras that are a picture": Refused("not a transforms.json"),
     "make: the oracle without a bank": Refused("--bank DIR"),
     "make: a bank that is gone": Refused("gone is not a bank"),
     "make: the output is a file": Refused("is a file"),
@@ -209,7 +209,7 @@ COMMANDS: dict[str, Refused] = {
     "batch: the output lies below a file": Refused("cannot be written"),
     "batch: an unknown knob": Refused("mesh.grit"),
     "batch: brackets without end": Refused("mesh.grid|nested|deep"),
-    "render: no package": Refused("no asset"),
+    "render: no package": Refused("not an asset"),
     "render: angles of words": Refused("left", USAGE),
     "render: angles are not numbers": Refused("nan|finite|degrees", USAGE),
     "render: infinite angles": Refused("inf|finite|degrees", USAGE),
@@ -226,7 +226,7 @@ COMMANDS: dict[str, Refused] = {
     "score: no package": Refused("not an asset"),
     "score: no truth": Refused("--truth: gone does not exist"),
     "bench: no objects": Refused("no objects"),
-    "bench: gone": Refused("no data set"),
+    "bench: gone": Refused("not a data set"),
     "view: no package": Refused("not an asset"),
     "up: an unknown pool": Refused("nowhere"),
     "watch: no output": Refused("--out", USAGE),

@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[Prepare, list[bytes], str]] = {
         [b"make", b"tape.png"],
         "not a regular file",
     ),
-    "command: a name that is no UTF-8": (
+    "command: a name that is not UTF-8": (
         lambda work: _named(work, b"caf\xe9.png"),
         [b"make", b"caf\xe9.png"],
         "UTF-8",

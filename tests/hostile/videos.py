@@ -109,7 +109,7 @@ def sound(container: str, codec: str) -> bytes:
 
 
 def titled(container: str, codec: str = "libx264", pixels: str = "yuv420p") -> bytes:
-    """Return a video with a title of bytes that are no UTF-8, as old cameras and editors write them."""
+    """Return a video with a title of bytes that are not UTF-8, as old cameras and editors write them."""
     file = io.BytesIO()
     with av.open(file, "w", format=container) as output:
         output.metadata["title"] = "caf. XXX"

@@ -94,7 +94,7 @@ def test_an_entry_that_lies_about_its_size_is_not_read_beyond_it(tmp_path: Path)
 
 def test_what_is_no_zip_is_said_so(tmp_path: Path) -> None:
     (tmp_path / "no.zip").write_text("no zip")
-    with pytest.raises(BadInput, match="the zip is broken, encrypted, or no zip"):
+    with pytest.raises(BadInput, match="the zip is broken, encrypted, or not a zip"):
         unpack(tmp_path / "no.zip", tmp_path, "the zip")
 
 

@@ -70,7 +70,7 @@ def header(width: int, height: int) -> bytes:
     [
         (header(8, 16), r"is 8 x 16 pixels; tile = \[1, 2\] and tile_size = 8 ask for 16 x 8"),
         (header(16, 8)[:20], "cut off or broken"),
-        (b"\xff\xd8\xff\xe0", "is no PNG"),
+        (b"\xff\xd8\xff\xe0", "is not a PNG"),
         (b"words", "text file"),
     ],
 )

@@ -5,14 +5,16 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import torch
 from pxr import Usd, UsdGeom
-from small_package import FPS, FRAMES, REACH, packed, tracked
+from small_package import FPS, FRAMES, REACH, gem, packed, tracked
 
+from dg4d_lib.assets.animated import Asset4D, interpolate_frames
 from dg4d_lib.assets.formats.usd import write_usdz
 from dg4d_lib.assets.scenes.compose import AnimatedGlb
 from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from dg4d_lib.errors import BadInput
-from steps.compose_scene import SceneWriter
+from steps.compose_scene import SceneWriter, _MovingGaussians
 
 SECONDS = FRAMES / FPS
 
@@ -30,6 +32,13 @@ def cast_of(package: Path, *items: SceneItem) -> SceneWriter:
 
 def item(name: str, **where: object) -> SceneItem:
     return SceneItem(package="p", name=name, **where)
+
+
+def resampled(times: int) -> Asset4D:
+    """Return the asset with so many keys per frame, also on the way back to the first frame."""
+    asset = tracked()
+    offsets = interpolate_frames(asset.offsets, torch.arange(times * FRAMES, dtype=torch.float64) / times)
+    return Asset4D(asset.mesh, offsets, times * FPS)
 
 
 def pictures(film: Path) -> np.ndarray:
@@ -66,6 +75,30 @@ def test_a_usdz_agrees_with_the_glb(package: Path, tmp_path: Path) -> None:
         asset, transform = tracked(), cast.actors[0].transform
         given = (asset.mesh.vertices + asset.offsets[frame]).numpy() @ transform[:3, :3].T + transform[:3, 3]
         np.testing.assert_allclose(sorted(points[:, 1]), sorted(given[:, 1]), atol=1e-5)
+
+
+@pytest.mark.parametrize("duration_s", [1.0, 6.0])
+def test_a_usdz_lasts_as_long_as_the_scene(duration_s: float, package: Path, tmp_path: Path) -> None:
+    cast = cast_of(package, item("slow", speed=SECONDS / 2, loop=False))  # plays for 2 seconds
+    cast.write_usdz(tmp_path / "scene.usdz", duration_s)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
+    assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(duration_s)
+
+
+def test_an_asset_that_plays_once_stands_in_its_last_pose(package: Path, tmp_path: Path) -> None:
+    fine = packed(tmp_path / "fine", fps=4 * FPS)  # its files have keys on the way back to the first frame
+    write_usdz(fine / "asset.usdz", resampled(4), 4 * FPS)
+    for folder in (package, fine):
+        cast = cast_of(folder, item("once", loop=False), item("again"))
+        once, again = cast.actors
+        cast.write_usdz(folder / "scene.usdz", 2.0)
+        stage = Usd.Stage.Open(str(folder / "scene.usdz"))
+        for actor, reach in ((once, REACH), (again, 0.0)):
+            mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/scene/{actor.name}/mesh/subject"))
+            points = np.array(mesh.GetPointsAttr().Get(2.0 * stage.GetTimeCodesPerSecond()))
+            assert points[:, 0].mean() - reach == pytest.approx(gem().vertices[:, 0].mean().item(), abs=1e-6)
+        states = _MovingGaussians(folder).at(once, torch.tensor([0.0, 2.0], dtype=torch.float64))
+        assert (states.means[1] - states.means[0])[:, 0].numpy() == pytest.approx(REACH, abs=1e-5)
 
 
 def test_a_usdz_says_what_would_loop_in_a_glb(package: Path, tmp_path: Path) -> None:
@@ -112,7 +145,7 @@ def test_a_film_does_not_depend_on_how_often_the_package_has_the_motion(package:
 
 
 def test_a_film_has_an_end(package: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="pictures"):
+    with pytest.raises(BadInput, match="1 to 300 frames"):
         cast_of(package, item("a")).write_preview(
             tmp_path / "scene.mp4", Scene(items=(item("a"),), fps=100, duration_s=600), "reference"
         )

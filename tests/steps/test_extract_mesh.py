@@ -136,7 +136,7 @@ def test_the_picture_shows_it_and_the_notes_say_how_well_it_fits(tracked: tuple[
 
 
 def test_the_notes_say_what_kind_of_surface_it_is(tracked: tuple[Path, StepReport]) -> None:
-    assert "at rest the mesh is watertight, 1 component, 0 inverted" in tracked[1].notes
+    assert "in the reference frame the mesh is watertight, 1 component, 0 inverted" in tracked[1].notes
 
 
 def test_the_frame_whose_surface_it_is_stays_with_the_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,7 +171,7 @@ def test_the_plan_says_what_is_extracted_and_from_which_frame(
     assert (plan.mode, plan.reference_frame) == expected
     made = {"tracked": "tracked", "per_frame": "meshes"}[plan.mode]
     assert {name for name, path in job.outputs.items() if path.exists()} == {"plan", made, "picture"}
-    refused = any("does not follow this motion (86.0% IoU" in note for note in facts.notes)
+    refused = any("does not follow this motion (trial mesh: 86.0% IoU" in note for note in facts.notes)
     assert refused == (mode == "auto" and plan.mode == "per_frame")
     picture = read_png(job.outputs["picture"])[..., :3]
     assert picture.shape == (256, 1024, 3)
@@ -218,7 +218,7 @@ def test_a_mesh_that_the_video_guides_follows_it_and_has_its_colors(
     assert iou(covered, alpha).min() > 0.8  # held still, 0.4: the ball also grows, for it comes nearer
     assert shown[covered[..., 0] == 1].mean(0).argmax() == 1  # green, from the video
     assert any("frame 2, which follows the driving video best" in note for note in facts.notes)
-    assert "a trial mesh of frame 2 had 90.0% IoU" in facts.notes
+    assert "trial mesh of frame 2: 90.0% silhouette IoU over the motion" in facts.notes
 
 
 def test_of_two_frames_the_one_whose_mesh_shows_the_video_stays(
@@ -237,7 +237,7 @@ def test_of_two_frames_the_one_whose_mesh_shows_the_video_stays(
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=tmp_path / "video")
     assert read_plan(tmp_path / "plan").other_candidates == (0,)
     assert read_tracked(tmp_path / "tracked").reference_frame == 0
-    (compared,) = [note for note in facts.notes if note.startswith("tracked, before registration")]
+    (compared,) = [note for note in facts.notes if note.startswith("PSNR at the input view after tracking")]
     worse, better = map(float, re.findall(r"frame \d ([\d.]+) dB", compared))
     assert worse < better - 3
 
@@ -264,7 +264,7 @@ def test_one_mesh_that_shows_the_video_far_worse_than_the_gaussians_is_given_up(
     _, facts = extract(tmp_path, ball(), MESH.model_copy(update={"mode": mode}), tmp_path / "video")
     assert (tmp_path / "tracked").exists() is not given_up
     assert read_plan(tmp_path / "plan").mode == ("per_frame" if given_up else "tracked")
-    assert any("every frame gets its own" in note for note in facts.notes) is given_up
+    assert any("a mesh per frame is used" in note for note in facts.notes) is given_up
 
 
 def test_no_face_is_flipped_against_the_first_frame() -> None:
@@ -305,7 +305,7 @@ def test_a_leg_that_the_grid_lacks_grows_out_of_the_mesh(tmp_path: Path, mode: s
     if mode == "tracked":
         asset = read_tracked(tmp_path / "tracked")
         moved = [replace(asset.mesh, vertices=asset.mesh.vertices + offset) for offset in asset.offsets]
-        assert any(note.endswith("grew out of it: 1") for note in facts.notes)
+        assert any(note.endswith("narrower than a cell of mesh.grid: 1") for note in facts.notes)
     else:
         moved = read_meshes(tmp_path / "meshes")
     for mesh, expected, frame in zip(moved, alpha, range(FRAMES), strict=True):
@@ -343,7 +343,7 @@ def test_what_no_trial_follows_gets_a_mesh_per_frame(
     _, facts = make_plan(tmp_path, ball(), MESH.model_copy(update={"mode": "auto"}), video=video)
     plan = read_plan(tmp_path / "plan")
     assert (plan.mode, plan.guide, plan.reference_frame) == ("per_frame", "gaussians", 0)
-    limit = "84.0% IoU on trial, mesh.min_guided" if with_video else "80.0% IoU on trial, mesh.min_followed"
+    limit = "84.0% IoU, mesh.min_guided requires" if with_video else "80.0% IoU, mesh.min_followed requires"
     assert any(limit in note for note in facts.notes)
 
 
@@ -393,7 +393,7 @@ def test_a_plan_comes_back_with_every_bit_and_other_files_are_refused(tmp_path: 
     write_plan(tmp_path / "plan", plan)
     assert read_plan(tmp_path / "plan") == plan
     (tmp_path / "plan").write_bytes(b"PK")
-    with pytest.raises(BadInput, match="no plan of a mesh"):
+    with pytest.raises(BadInput, match="not a plan of a mesh"):
         read_plan(tmp_path / "plan")
 
 

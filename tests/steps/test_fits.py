@@ -1,4 +1,4 @@
-"""The two fitting steps: files in, files out, and what they do when a loss is no number."""
+"""The two fitting steps: files in, files out, and what they do when a loss is not a number."""
 
 import json
 import zipfile

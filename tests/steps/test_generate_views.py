@@ -53,7 +53,7 @@ def test_a_model_draws_a_bank_and_the_record_names_it(tmp_path: Path, monkeypatc
     assert any("transformer" in name for name in report.weights) and any("lora" in name for name in report.weights)
     assert set(report.licenses) >= {str(model), str(lora)}
     assert f"License found for {model}: apache-2.0: commercial use is allowed." in report.notes
-    assert report.notes[0].startswith("2 views of other sides were drawn by a model")
+    assert report.notes[0].startswith("2 views of other sides were generated")
     assert read_png(tmp_path / "picture.png").shape == (2 * 96, 3 * 96, 3)
 
 
@@ -77,8 +77,8 @@ def test_drawn_pictures_are_cut_out_and_empty_ones_left_out_with_a_note() -> Non
     directions = [DrawnDirection(90, 0), DrawnDirection(180, 0)]
     views, notes = cut_views([drawn(3), torch.ones(64, 64, 3)], directions, 64, "backdrop", segmenter)
     assert [view.camera.azimuth_deg for view in views] == [90] and views[0].cutout.shape == (64, 64, 4)
-    assert len(notes) == 1 and notes[0].startswith("drawn view at azimuth 180, elevation 0 shows no subject")
-    with pytest.raises(BadInput, match=r"no drawn picture shows the subject .*views\.kind=none"):
+    assert len(notes) == 1 and notes[0].startswith("generated view at azimuth 180, elevation 0 shows no subject")
+    with pytest.raises(BadInput, match=r"no generated picture shows the subject .*views\.kind=none"):
         cut_views([torch.ones(64, 64, 3)], directions[:1], 64, "backdrop", segmenter)
 
 
@@ -89,7 +89,7 @@ def test_views_that_agree_are_kept_with_their_weights() -> None:
     kept, judgments, notes = weighted_views(front, [known_view(cutout, azimuth) for azimuth in (90, 180, 270)], 0.2)
     assert len(kept) == len(judgments) == 3 and not notes
     assert all(view.weight > 0.8 for view in kept)
-    with pytest.raises(BadInput, match="none of the 3 drawn views agrees"):
+    with pytest.raises(BadInput, match="none of the 3 generated views agrees"):
         weighted_views(front, [known_view(cutout, azimuth) for azimuth in (90, 180, 270)], 1.1)
 
 
@@ -97,7 +97,7 @@ def test_low_weights_are_named_with_their_reason() -> None:
     views = [known_view(torch.zeros(8, 8, 4), name=name) for name in ("one", "two", "three")]
     found = judgment_notes(views, [Judgment(1, 1), Judgment(0.2, 0.9), Judgment(1, 0.3)])
     assert found == (
-        "drawn views that disagree with the others count little: two (0.18: outline); three (0.30: colors)",
+        "generated views that contradict the others have a low weight: two (0.18: outline); three (0.30: colors)",
     )
     assert not judgment_notes(views[:1], [Judgment(0.9, 0.9)])
 

@@ -133,7 +133,7 @@ def test_every_trouble_has_its_kind_and_keeps_its_pictures(store: ArtifactStore,
 
 @pytest.mark.parametrize("trouble", ["memory", "torch memory"])
 def test_without_memory_a_step_says_what_to_do(store: ArtifactStore, trouble: str) -> None:
-    assert "choose smaller settings" in failure(request_for(store, trouble=trouble), store).message
+    assert "or lower subject.size, static.views" in failure(request_for(store, trouble=trouble), store).message
 
 
 def test_a_forgotten_output_is_named(store: ArtifactStore) -> None:

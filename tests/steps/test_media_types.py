@@ -103,10 +103,10 @@ def test_numpy_archives_are_told_from_other_zips(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", vertices=np.zeros((2, 3, 3)), faces=np.zeros((1, 3), int))
     check_arrays(tmp_path / "a.npz")
     (tmp_path / "b.npz").write_bytes(packed(("vertices.npy", b"root:x:0:0")))
-    with pytest.raises(BadInput, match=r"vertices\.npy is no array"):
+    with pytest.raises(BadInput, match=r"vertices\.npy is not an array"):
         check_arrays(tmp_path / "b.npz")
     (tmp_path / "c.npz").write_bytes(SECRETS["passwd"])
-    with pytest.raises(BadInput, match="no NumPy archive"):
+    with pytest.raises(BadInput, match="not a NumPy archive"):
         check_arrays(tmp_path / "c.npz")
 
 

@@ -74,5 +74,5 @@ def test_the_planes_cover_the_cloud_or_the_box_that_was_asked_for():
 
 def test_another_file_is_no_motion(tmp_path: Path):
     (tmp_path / "m").write_bytes(b"not safetensors at all")
-    with pytest.raises(BadInput, match="is no motion"):
+    with pytest.raises(BadInput, match="is not a motion"):
         read_motion(tmp_path / "m")

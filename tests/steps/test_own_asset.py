@@ -174,7 +174,7 @@ def test_the_note_tells_rigid_parts_from_a_surface_that_bends() -> None:
     turns = torch.tensor([[1.0, 0, 0, 0], [0.9, 0.1, 0, 0], [0.9, 0, 0.1, 0]])
     quats = turns[[0, 1, 1, 2, 2, 2]].expand(4, 6, 4)
     motion = NodeMotion(quats, torch.zeros(4, 6, 3), quats[:, 0], torch.zeros(4, 3))
-    assert "The model moves as 3 rigid parts;" in animate_asset.motion_note(motion, 4)
+    assert "The model was animated as 3 rigid parts," in animate_asset.motion_note(motion, 4)
     assert animate_asset.motion_note(motion, 2) == animate_asset.NOTE
 
 
@@ -331,9 +331,9 @@ REFUSED = {
     ),
     "missing buffer": ({"model_gltf": json.dumps(
         {"asset": {"version": "2.0"}, "buffers": [{"uri": "a.bin", "byteLength": 4}]}).encode()}, "buffer .* missing"),
-    "no json": ({"model_gltf": b"{"}, r"no glTF 2\.0 \(Expecting"),
-    "no object": ({"model_gltf": b"[]"}, r"no glTF 2\.0 \(its JSON is no object"),
-    "no glb": ({"model_glb": b"{}"}, r"no GLB 2\.0 \(it starts with"),
+    "no json": ({"model_gltf": b"{"}, r"not a glTF 2\.0 file \(Expecting"),
+    "no object": ({"model_gltf": b"[]"}, r"not a glTF 2\.0 file \(its JSON is not an object"),
+    "no glb": ({"model_glb": b"{}"}, r"not a GLB 2\.0 file \(it starts with"),
     "splats without color": (
         {"model_ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nend_header\n"},
         "no splat colors",

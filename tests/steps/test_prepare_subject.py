@@ -1,3 +1,4 @@
+import re
 import zipfile
 from pathlib import Path
 
@@ -79,8 +80,8 @@ def table(right_leg: int, frames: int = 8) -> np.ndarray:
 @pytest.mark.parametrize(
     ("right_leg", "ground_turn", "least", "most", "noted"),
     [
-        (20, 0.5, 3, 25, "its right end is nearer"),
-        (14, 0.5, 0, 0, "it is level"),
+        (20, 0.5, 3, 25, ", right end nearer; "),
+        (14, 0.5, 0, 0, ": 0 degrees"),
         (20, 0.0, None, None, ""),
         (14, 0.0, None, None, ""),
     ],
@@ -90,13 +91,13 @@ def test_footage_is_turned_as_its_ground_line(right_leg, ground_turn, least, mos
     facts = prepare(source, tmp_path / "out", framing="keep", ground_turn=ground_turn)
     found = read_turn(tmp_path / "out" / "pose.json")
     assert found is None if least is None else least <= found <= most
-    assert [noted in note for note in facts.notes if "ground line" in note] == [True] * bool(noted)
+    assert [noted in note for note in facts.notes if "estimated yaw" in note] == [True] * bool(noted)
 
 
 def test_a_broken_pose_is_refused(tmp_path):
     for text in ("{", '{"turn_deg": 80}', "{}", "[]"):
         (tmp_path / "pose.json").write_text(text)
-        with pytest.raises(BadInput, match="no pose"):
+        with pytest.raises(BadInput, match="not a pose"):
             read_turn(tmp_path / "pose.json")
     assert read_turn(None) is None
 
@@ -214,6 +215,32 @@ def test_pictures_that_are_no_depth_are_refused(tmp_path, name, pixels, form, re
         prepare(source, tmp_path / "out", depth=save(tmp_path / name, pixels, form))
 
 
+def sparse(share: float, size: int = 256) -> np.ndarray:
+    """Distances of a wall, known for a share of its pixels at random."""
+    known = np.random.default_rng(0).random((size, size, 1)) < share
+    return np.where(known, slanted(size), np.nan).astype(np.float32)
+
+
+def test_sparse_depth_is_used_and_its_share_is_reported(tmp_path):
+    source = save(tmp_path / "a.png", np.kron(disc(left=20), np.ones((4, 4, 1), np.uint8)))
+    facts = prepare(source, tmp_path / "out", depth=save(tmp_path / "d.exr", sparse(0.4), "float"))
+    (note,) = (note for note in facts.notes if note.startswith("depth:"))
+    assert int(re.findall(r"known for (\d+)% of the subject", note)[0]) == pytest.approx(40, abs=5)
+    field = read_depth_field(tmp_path / "out" / "depth_field.safetensors")
+    alpha = read_png(tmp_path / "out" / "subject.png")[..., 3]
+    assert float((field.known & (alpha > 0.5)).sum() / (alpha > 0.5).sum()) > 0.8
+    dense = prepare(source, tmp_path / "dense", depth=save(tmp_path / "d.exr", slanted(256), "float"))
+    assert not any("known for" in note for note in dense.notes)
+    rises = [rise(tmp_path / name / "depth_field.safetensors") for name in ("out", "dense")]
+    assert rises[0] == pytest.approx(rises[1], abs=0.01)
+
+
+def test_too_sparse_depth_is_refused_with_its_share(tmp_path):
+    source = save(tmp_path / "a.png", np.kron(disc(left=20), np.ones((4, 4, 1), np.uint8)))
+    with pytest.raises(BadInput, match=r"values for (1[5-9]|2[0-4])% of the subject"):
+        prepare(source, tmp_path / "out", depth=save(tmp_path / "d.exr", sparse(0.2), "float"))
+
+
 def test_videos_and_zips_are_no_depth(tmp_path):
     source = save(tmp_path / "a.png", disc())
     frames = zipped(tmp_path / "d.zip", [disc(), disc()])
@@ -271,13 +298,26 @@ def test_a_video_takes_a_mask_for_every_frame(tmp_path):
     [
         (lambda height, width: half_mask(height, width + 8), r"--mask is \d+ x \d+ pixels, the picture \d+ x \d+"),
         (lambda height, width: np.zeros((height, width, 3), np.uint8), "the mask is empty"),
+        (lambda height, width: half_mask(height, width) // 255, "largest value is 1 of 255, .* multiply .* by 255"),
+        (lambda height, width: half_mask(height, width) * np.uint8([1, 0, 0]), "--mask is colored"),
     ],
-    ids=["size", "empty"],
+    ids=["size", "empty", "labels", "colored"],
 )
 def test_a_mask_that_does_not_fit_is_refused(tmp_path, mask, says):
     picture = opaque(disc())
     with pytest.raises(BadInput, match=says):
         prepare(save(tmp_path / "a.png", picture), tmp_path / "out", save(tmp_path / "m.png", mask(*picture.shape[:2])))
+
+
+def test_a_mask_of_off_white_is_read(tmp_path):
+    picture = opaque(disc())
+    mask = half_mask(*picture.shape[:2]) - np.uint8([0, 5, 15]) * (half_mask(64, 64) > 0)
+    prepare(save(tmp_path / "a.png", picture), tmp_path / "out", save(tmp_path / "m.png", mask))
+
+
+def test_a_box_of_one_pixel_is_refused_without_a_warning(tmp_path):
+    with pytest.raises(BadInput, match=r"no subject found|at least \d+ pixels"):
+        prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out", box=(30, 30, 1, 1))
 
 
 def test_one_mask_for_a_video_is_refused(tmp_path):

@@ -137,7 +137,7 @@ def test_a_turntable_of_either_direction_is_placed_around_the_subject(sign, tmp_
             [0.0, 90, 180, 270],
             "--turntable has 4 frames; give a video, or a folder of frames, of one whole turn with 8 or more",
         ),
-        ([4.0 * i for i in range(12)], "--turntable is no whole turn"),
+        ([4.0 * i for i in range(12)], "--turntable is not a whole turn"),
     ],
 )
 def test_a_turntable_that_is_no_turn_is_refused(azimuths, refusal, tmp_path):

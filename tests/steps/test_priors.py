@@ -260,7 +260,7 @@ def test_footage_and_hints_turn_every_prior(tmp_path: Path) -> None:
             write_pose(tmp_path / "pose.json", Pose(turn_deg=shown))
             assert subject_hint(settings, tmp_path / "pose.json", None, 0.0) == DepthHint(found)
             assert subject_hint(settings, tmp_path / "pose.json", None, -5.0) == DepthHint(-5)
-        assert subject_hint(settings, None, None, 0.0).says_nothing
+        assert subject_hint(settings, None, None, 0.0).is_empty
 
 
 def test_a_depth_field_survives_its_file_and_bends_both_priors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,10 +298,10 @@ def test_broken_depth_fields_are_refused(tmp_path: Path) -> None:
     ):
         tensors = {"middle": middle, "known": there}
         save_file(tensors, tmp_path / "field.safetensors", {"depth_field": '{"sigma": 0.1}'})
-        with pytest.raises(BadInput, match="no depth field"):
+        with pytest.raises(BadInput, match="not a depth field"):
             read_depth_field(tmp_path / "field.safetensors")
     (tmp_path / "field.safetensors").write_bytes(b"none")
-    with pytest.raises(BadInput, match="no depth field"):
+    with pytest.raises(BadInput, match="not a depth field"):
         read_depth_field(tmp_path / "field.safetensors")
 
 

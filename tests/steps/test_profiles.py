@@ -68,22 +68,22 @@ SHOWN = "; `dg4d settings motion.iterations` shows what is allowed"
     ("changes", "message"),
     [
         ({"motion.iterations": 0}, "motion.iterations = 0: Input should be greater than or equal to 1" + SHOWN),
-        ({"motion.iterations": "ten"}, "motion.iterations = 'ten' is no whole number" + SHOWN),
-        ({"motion.iterations": 1.5}, "motion.iterations = 1.5 is no whole number" + SHOWN),
-        ({"motion.iterations": None}, "motion.iterations = None is no whole number" + SHOWN),
+        ({"motion.iterations": "ten"}, "motion.iterations = 'ten' is not a whole number" + SHOWN),
+        ({"motion.iterations": 1.5}, "motion.iterations = 1.5 is not a whole number" + SHOWN),
+        ({"motion.iterations": None}, "motion.iterations = None is not a whole number" + SHOWN),
         (
             {"prior.weight": "x"},
-            "prior.weight = 'x' is no number; `dg4d settings prior.weight` shows what is allowed",
+            "prior.weight = 'x' is not a number; `dg4d settings prior.weight` shows what is allowed",
         ),
         (
             {"subject.box": [0, -1, "x", 4]},
-            "subject.box.1 = -1: Input should be greater than or equal to 0; subject.box.2 = 'x' is no whole number; "
-            "`dg4d settings subject.box` shows what is allowed",
+            "subject.box.1 = -1: Input should be greater than or equal to 0; subject.box.2 = 'x' is not a whole "
+            "number; `dg4d settings subject.box` shows what is allowed",
         ),
         (
             {"motion.iterations": "ten", "static.iterations": -1},
-            "static.iterations = -1: Input should be greater than or equal to 0; motion.iterations = 'ten' is no whole "
-            "number; `dg4d settings NAME` shows what is allowed",
+            "static.iterations = -1: Input should be greater than or equal to 0; motion.iterations = 'ten' is not a "
+            "whole number; `dg4d settings NAME` shows what is allowed",
         ),
     ],
 )

@@ -208,7 +208,7 @@ def without(name: str) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("damage", "mesh", "says"),
     [
-        (without("asset.json"), False, "is no asset"),
+        (without("asset.json"), False, "is not an asset"),
         (lambda folder: (folder / "asset.json").write_text("{"), False, "cannot be used"),
         (without("splats/002.ply"), False, "2 frames, the package 3"),
         (without("asset.glb"), True, r"asset\.glb cannot be read"),
@@ -225,5 +225,5 @@ def test_a_damaged_package_is_refused(
 
 
 def test_a_folder_that_is_no_package_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is no asset"):
+    with pytest.raises(BadInput, match="is not an asset"):
         render(tmp_path / "nowhere", tmp_path / "out")

@@ -249,7 +249,7 @@ def test_of_opaque_pictures_what_is_not_white_is_the_subject(package: Path, trut
     mean = report["rows"]["asset"]["mean"]
     assert mean["psnr"] > 45  # rounding at the rim
     assert 0.3 < mean["iou"] < 0.7  # what is nearly transparent is not white
-    assert report["notes"] == ["masks of the truth are guessed, its pictures are opaque: input, view_15"]
+    assert report["notes"] == ["ground-truth masks are estimated, because these pictures are opaque: input, view_15"]
 
 
 def test_frames_that_are_not_square_or_of_several_sizes_are_refused(package: Path, truth: Path, tmp_path: Path) -> None:

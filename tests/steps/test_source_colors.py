@@ -48,7 +48,7 @@ def test_colors_of_a_profile_become_srgb(tmp_path, suffix):
         (exchanged().replace(b"RGB ", b"R\xffB ", 1), True),
         (exchanged() + bytes(LARGEST_PROFILE), True),
     ],
-    ids=["none", "sRGB", "Lab", "text", "cut off", "space is no ASCII", "huge"],
+    ids=["none", "sRGB", "Lab", "text", "cut off", "space is not ASCII", "huge"],
 )
 def test_profiles_of_srgb_and_those_that_cannot_be_used_change_no_color(content, is_noted):
     picture = torch.rand(40, 40, 4, generator=torch.Generator().manual_seed(0))

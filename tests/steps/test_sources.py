@@ -443,7 +443,7 @@ def test_a_video_that_changes_its_size_is_refused(tmp_path):
     first = save_clip(tmp_path / "a.ts", walk(4), "mpeg2video", "yuv420p", 25)
     second = save_clip(tmp_path / "b.ts", small, "mpeg2video", "yuv420p", 25)
     (tmp_path / "c.ts").write_bytes(first.read_bytes() + second.read_bytes())
-    with pytest.raises(BadInput, match="changes its size"):
+    with pytest.raises(BadInput, match="changes its frame size"):
         read(tmp_path / "c.ts")
 
 

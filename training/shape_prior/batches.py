@@ -1,4 +1,4 @@
-"""Batches of made-up samples, by number: the same seed and number give the same batch in any process."""
+"""Batches of synthetic samples, by number: the same seed and number give the same batch in any process."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Samples: a made-up shape, seen as `prepare_subject` shows it, with the matter and colors behind every pixel."""
+"""Samples: a synthetic shape, seen as `prepare_subject` shows it, with the matter and colors behind every pixel."""
 
 import math
 from collections.abc import Sequence

@@ -36,7 +36,7 @@ def sheet(rows: Sequence[Sequence[UInt8[np.ndarray, "s s 3"]]]) -> Image.Image:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write a contact sheet of made-up shapes."""
+    """Write a contact sheet of synthetic shapes."""
     parser = argparse.ArgumentParser(prog="python -m training.shape_prior.sheets", description=main.__doc__)
     parser.add_argument("output", type=Path)
     parser.add_argument("--family", choices=[*FAMILIES, "each"], help="one of them, or one row of each")

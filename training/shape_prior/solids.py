@@ -1,4 +1,4 @@
-"""Solids of made-up shapes: primitives with a frame of their own, joined, carved and painted.
+"""Solids of synthetic shapes: primitives with a frame of their own, joined, carved and painted.
 
 Object space: right-handed, y up, the front looks along +z, x = 0 is the mirror plane.
 """

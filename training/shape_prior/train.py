@@ -54,7 +54,7 @@ class Plan:
     """Settings of a training run; a run that goes on may change `samples` alone.
 
     Attributes:
-        samples: made-up shapes that are shown, each once.
+        samples: synthetic shapes that are shown, each once.
         batch: samples of a step.
         rays: of each sample that are supervised.
         lr: peak learning rate.
@@ -352,7 +352,7 @@ def _device(text: str) -> torch.device:
     except RuntimeError:
         device = torch.device("meta")
     if device.type not in ("cpu", "cuda"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no device for training; give cpu or cuda")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a device for training; give cpu or cuda")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise argparse.ArgumentTypeError(f"{text!r}: torch finds {torch.cuda.device_count()} CUDA devices; give cpu")
     return device
@@ -399,7 +399,7 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
     """Return the state of a run on the processor, where optimizers keep their step counts.
 
     Raises:
-        BadInput: the file is no checkpoint of a run, or its weights are not finite.
+        BadInput: the file is not a checkpoint of a run, or its weights are not finite.
     """
     with _checkpoint_errors(path):
         state: dict[str, Any] = dict(torch.load(path, weights_only=True, map_location=CPU))
@@ -414,7 +414,7 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _checkpoint_errors(path: Path) -> Iterator[None]:
-    """Turn errors of a file that is no checkpoint of a run into BadInput."""
+    """Turn errors of a file that is not a checkpoint of a run into BadInput."""
     try:
         yield
     except UNREADABLE as error:

@@ -1,4 +1,4 @@
-"""Random deformation of made-up shapes by a smooth displacement field, and attachment of small things."""
+"""Random deformation of synthetic shapes by a smooth displacement field, and attachment of small things."""
 
 import math
 from collections.abc import Callable

@@ -24,7 +24,7 @@ from dg4d_lib.assets.formats.foreign_nodes import (
 )
 from dg4d_lib.assets.formats.gltf import GlbReader, json_object, read_accessor
 from dg4d_lib.errors import BadInput
-from dg4d_lib.mesh.models.model import Model, ModelPart, far_center, moved_note
+from dg4d_lib.mesh.models.model import Model, ModelPart, far_center, moved_note, transform_normals
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 MORPHED = ("POSITION", "NORMAL", "TANGENT")  # attributes whose morph targets are read
@@ -112,7 +112,7 @@ def moved_pieces(glb: ForeignGlb) -> NDArray[np.float32]:
 def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
     tree = reader.tree
     if not isinstance(tree, dict) or str(json_object(tree.get("asset")).get("version", ""))[:1] != "2":
-        raise BadInput("the model is no glTF 2.0; export it as GLB")
+        raise BadInput("the model is not a glTF 2.0 file; export it as GLB")
     for extension, remedy in UNREADABLE.items():
         if extension in tree.get("extensionsRequired", ()):
             raise BadInput(f"the model cannot be read: {remedy}")
@@ -159,7 +159,7 @@ def _pieces(reader: GlbReader, shown: Sequence[tuple[int, int]], globals_: Matri
     """Return the pieces with triangles, of the given nodes and primitives."""
     pieces = [_piece(reader, node, number, globals_, colors) for node, number in shown]
     if not any(len(piece.part.faces) for piece in pieces):
-        raise BadInput("the model shows no triangles; give a mesh with faces")
+        raise BadInput("the model contains no triangles; give a mesh with faces")
     return [piece for piece in pieces if len(piece.part.faces)]
 
 
@@ -185,11 +185,15 @@ def _piece(
     count = len(local)
     matrices = mesh_matrices(reader, node, number, globals_)
     if len(matrices) > 1 and flattening(matrices).any():
-        raise BadInput("the skeleton of the model flattens it at rest; apply it and export the mesh again")
+        raise BadInput(
+            "the rest pose of the skeleton collapses the mesh to a plane; apply the armature and export again"
+        )
     faces = _faces(reader, primitive, count)
     shading = base_colors.read(primitive)
-    uvs, colors = shading.uvs, shading.colors
-    if any(values is not None and len(values) != count for values in (uvs, colors)):
+    uvs, colors, normals = shading.uvs, shading.colors, morphed.get("NORMAL")
+    if normals is None and "NORMAL" in attributes:
+        normals = read_accessor(reader, attributes["NORMAL"])
+    if any(values is not None and len(values) != count for values in (uvs, colors, normals)):
         raise BadInput("the attributes of a mesh of the model have different lengths; export it again")
     with np.errstate(all="ignore"):
         vertices = transform_points(matrices, local).astype(np.float32)
@@ -204,6 +208,7 @@ def _piece(
         colors,
         shading.masked,
         shading.wrap,
+        None if normals is None else transform_normals(matrices, normals),
     )
     return Piece(node, number, local.astype(np.float32), matrices, faces, morphed, part)
 

@@ -1,8 +1,9 @@
 """GLBs of other programs in motion: the same file with morph targets over time, and its skeleton animated.
 
-Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. A skeleton moves,
-and morph targets do what it cannot. Existing animations are dropped, since they would move the model twice, and scenes
-that are not shown, since their nodes may be shared; existing morph targets keep their default weights.
+Everything in the file is kept: nodes, names, materials, textures, texture coordinates and skeletons. The skeleton
+is animated, and morph targets add what it cannot reproduce. Existing animations are dropped, since they would move the
+model twice, and scenes that are not shown, since their nodes may be shared; existing morph targets keep their default
+weights.
 """
 
 import json
@@ -34,15 +35,17 @@ from dg4d_lib.assets.formats.foreign_skeleton import (
 )
 from dg4d_lib.assets.formats.gltf import MAX_POSES, VERTEX_DATA, GlbReader, GltfDocument, json_object
 from dg4d_lib.assets.formats.joint_motion import close_loop
-from dg4d_lib.assets.formats.normals import SmoothNormals
+from dg4d_lib.assets.formats.normals import SmoothNormals, normal_groups
 from dg4d_lib.assets.formats.tracks import Animation
+from dg4d_lib.mesh.models.model import Model
 from dg4d_lib.mesh.tracking.rig import continuous_quats
 
 SAMPLE = 2000  # vertices, evenly chosen, that the motion of a skeleton is fitted to
 PLACEMENT = "dg4d placement"
 MOTION = "dg4d motion"
-MOVES = "the skeleton of the model moves; what it cannot do is in morph targets"
-AT_REST = "the skeleton of the model is kept at rest, for {}; morph targets have the motion"
+MOVES = "the model is animated by its skeleton; morph targets add what the skeleton cannot reproduce"
+TANGENTS = "the tangents of the model were left out; players compute those of the moved surface"
+AT_REST = "the skeleton of the model is not animated ({}); the motion is in morph targets"
 
 
 def write_moving_glb(
@@ -78,6 +81,8 @@ def write_moving_glb(
         notes.append("the animations of the model were dropped: the new motion takes their place")
     if len(tree["scenes"]) > 1:
         notes.append("the scenes of the model that are not shown were dropped")
+    if any("TANGENT" in mesh_attributes(tree, piece.node, piece.primitive) for piece in glb.pieces):
+        notes.append(TANGENTS)
     step = -(-len(moved) // MAX_POSES)
     if step > 1:
         notes.append(f"the animated model has a key every {step} frames; {MAX_POSES} morph targets are allowed")
@@ -109,10 +114,11 @@ def write_moving_glb(
                 for name, values in piece.morphed.items()
             }
             primitive["attributes"] = {**primitive["attributes"], **at_default}
+            primitive["attributes"].pop("TANGENT", None)  # it would not turn with the normals
             inverses = _inverses(glb, piece, skeleton, back)
-            primitive["targets"] = _targets(
-                document, piece, zip(keys, states, inverses, strict=False), primitive, moving_normals
-            )
+            turns = moving_normals and "NORMAL" in primitive["attributes"]
+            poses = zip(keys, states, inverses, strict=False)
+            primitive["targets"] = _targets(document, piece, poses, _smooth_normals(piece, states) if turns else None)
         mesh["primitives"] = [one for one in mesh["primitives"] if "targets" in one]  # all need as many targets
         mesh["weights"] = track[0].tolist()
         mesh["extras"] = {**json_object(mesh.get("extras")), "targetNames": [f"frame_{pose:03d}" for pose in keys[:-1]]}
@@ -176,7 +182,7 @@ def _animate_joints(
 def _inverses(
     glb: ForeignGlb, piece: Piece, skeleton: SkeletonMotion | None, back: NDArray[np.float64]
 ) -> Iterable[NDArray[np.float64]]:
-    """Return what leads from the world to the coordinates of a piece's mesh, at every frame."""
+    """Return the world-to-mesh matrices of a piece, one per frame."""
     if skeleton is None:
         return repeat(_inverse(piece.matrices) @ back)
     skin = skin_of(glb.reader.tree, piece.node, piece.primitive)
@@ -192,19 +198,26 @@ def _by_node(pieces: Sequence[Piece]) -> dict[int, list[Piece]]:
     return found
 
 
+def _smooth_normals(piece: Piece, states: NDArray[np.float32]) -> SmoothNormals:
+    """Return the normals of a piece in any pose; they are shared where the file gives equal ones at one place."""
+    given = Model((piece.part,)).smoothing_groups
+    return SmoothNormals(normal_groups(np.concatenate([piece.local[None], states]), piece.faces, given), piece.faces)
+
+
 def _targets(
     document: GltfDocument,
     piece: Piece,
     poses: Iterable[tuple[int, NDArray[np.float32], NDArray[np.float64]]],
-    primitive: dict[str, Any],
-    moving_normals: bool,
+    normals_of: SmoothNormals | None,
 ) -> list[dict[str, int]]:
     """Add displacements in the coordinates of the mesh; return the morph targets.
 
-    `poses` are frames with the vertices in the world, and the matrices from there to the coordinates of the mesh.
+    Args:
+        document: document to extend.
+        piece: vertices at rest.
+        poses: frames with the vertices in the world, and the matrices from there to the coordinates of the mesh.
+        normals_of: normals of the mesh in any pose; None to keep those at rest.
     """
-    turning = "NORMAL" in primitive["attributes"] and moving_normals
-    normals_of = SmoothNormals(piece.local, piece.faces) if turning else None
     rest = normals_of(piece.local) if normals_of else None
     targets = []
     for frame, state, inverse in poses:
@@ -274,7 +287,7 @@ def _reopened(reader: GlbReader, extras: dict[str, Any]) -> GltfDocument:
 
 
 def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses; where a twisted joint flattens a vertex's surroundings, the nearest thing to one."""
+    """Invert matrices; use the pseudo-inverse where skinning makes one singular."""
     flat = flattening(matrices)
     found: NDArray[np.float64] = np.linalg.inv(np.where(flat[:, None, None], np.eye(4), matrices))
     if flat.any():

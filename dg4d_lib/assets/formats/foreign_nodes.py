@@ -111,7 +111,7 @@ def mesh_matrices(reader: GlbReader, node: int, primitive: int, globals_: Matric
 
 
 def parents_of(tree: dict[str, Any], nodes: Iterable[int]) -> dict[int, int]:
-    """Return the parent of every node that hangs on one of these nodes."""
+    """Return the parent of every child of these nodes."""
     return {child: node for node in nodes for child in tree["nodes"][node].get("children", ())}
 
 

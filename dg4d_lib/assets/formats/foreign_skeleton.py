@@ -1,6 +1,7 @@
 """Motion of the skeleton that a model of another program has, fitted to the motion of the model's vertices.
 
-Joints keep their distances and the weights that the model gives them. What they cannot do is left to morph targets.
+Joints keep their distances and the weights that the model gives them. What they cannot reproduce is left
+to morph targets.
 """
 
 from collections.abc import Mapping, Sequence, Set
@@ -86,14 +87,14 @@ class SkeletonMotion:
         """Return the motion of a joint relative to its parent.
 
         Raises:
-            SkeletonAtRest: its matrix is no rotation with a scale, as below nodes that are scaled unevenly.
+            SkeletonAtRest: its matrix is not a rotation with a scale, as below nodes that are scaled unevenly.
         """
         local = self.matrices(joint)
         try:
             if joint in self.parents:
                 local = np.linalg.inv(self.matrices(self.parents[joint])) @ local
         except np.linalg.LinAlgError as error:
-            raise SkeletonAtRest("a node above its joints is flat") from error
+            raise SkeletonAtRest("an ancestor of its joints has a singular scale") from error
         scale = np.linalg.norm(local[0, :3, :3], axis=0)
         scale[0] *= np.sign(np.linalg.det(local[0, :3, :3]))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -116,7 +117,7 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
     """
     joints, movers, above = joints_and_movers(rest, parents, {joint for one in skinned for joint in one.joints})
     if len(joints) > MOST_JOINTS:
-        raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are moved")
+        raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are animated")
     weights = [_by_joint(one, movers, len(joints)) for one in skinned]
     if not any(one.any() for one in weights):
         raise SkeletonAtRest("it moves no vertex")
@@ -127,7 +128,7 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
     padded = np.pad(np.concatenate(weights), ((0, 0), (1, 0)))  # none of the bone that all roots hang on
     maps = _fitted(still, start[known], moved[known], padded[known])
     if maps is None:
-        raise SkeletonAtRest("it cannot move as the video shows")
+        raise SkeletonAtRest("it cannot reproduce the motion of the video")
     matrices = np.tile(np.eye(4), (*maps.shape[:2], 1, 1))
     matrices[:, :, :3] += maps
     return SkeletonMotion(rest, parents, movers, joints, matrices[1:].swapaxes(0, 1))
@@ -170,17 +171,17 @@ def _fitted(
         root = center + maps[0, :, :, :3] @ center + maps[0, :, :, 3]
         skeleton = replace(skeleton, rotations=maps[..., :3] + np.eye(3), root=root)
         for _ in range(ROUNDS):
-            skeleton = fit_rotations(_ends_follow(skeleton, empty), rest, moved, weights)
+            skeleton = fit_rotations(_copy_parent_rotations_to_leaves(skeleton, empty), rest, moved, weights)
     except np.linalg.LinAlgError:
         return None
-    maps = _ends_follow(skeleton, empty).maps()
+    maps = _copy_parent_rotations_to_leaves(skeleton, empty).maps()
     shown = np.einsum("nk,ktij,nj->nti", weights, maps[..., :3], rest, optimize=True)
     shown += np.einsum("nk,kti->nti", weights, maps[..., 3])
     return maps if np.square(moved - shown).sum() < np.square(moved).sum() else None
 
 
 def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int) -> Articulation:
-    """Return joints as bones at rest, after one more at their center that all without a joint above hang on."""
+    """Return the joints as bones in the rest pose, after a root bone at their center that parents all root joints."""
     joints = np.concatenate([places.mean(0, keepdims=True), places])
     still = np.tile(np.eye(3), (len(joints), frames, 1, 1))
     parents = np.array([-1, *(1 + one for one in above)])
@@ -195,8 +196,8 @@ def _by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -
     return dense
 
 
-def _ends_follow(skeleton: Articulation, empty: Bool[np.ndarray, " k"]) -> Articulation:
-    """Let bones that move no vertex turn as their parents do."""
+def _copy_parent_rotations_to_leaves(skeleton: Articulation, empty: Bool[np.ndarray, " k"]) -> Articulation:
+    """Give bones that move no vertex the rotations of their parents."""
     rotations = skeleton.rotations.copy()
     for bone in np.flatnonzero(empty):
         if bone:

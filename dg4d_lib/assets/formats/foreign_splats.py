@@ -43,7 +43,7 @@ def read_foreign_ply(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple
     """Read splats; return them with notes.
 
     Raises:
-        BadInput: the file is no splat PLY, lacks color, has too many splats or numbers that are not finite.
+        BadInput: the file is not a splat PLY, lacks color, has too many splats or numbers that are not finite.
     """
     header = header_text(content)
     if b"\nelement chunk " in header:
@@ -73,13 +73,13 @@ def read_spz(content: bytes, most: int = MOST) -> tuple[Gaussians, tuple[str, ..
     """Read splats; return them with notes.
 
     Raises:
-        BadInput: the file is no SPZ of the versions 2 to 4, is truncated, or has too many splats.
+        BadInput: the file is not an SPZ of the versions 2 to 4, is truncated, or has too many splats.
     """
     try:
         with io.BytesIO(content) if content.startswith(MAGIC) else gzip.GzipFile(fileobj=io.BytesIO(content)) as stream:
             magic, version, count, degree, bits, _, streams = struct.unpack("<4sIIBBBB", stream.read(SPZ_HEADER))
             if magic != MAGIC or version not in (2, 3, 4) or degree > HIGHEST_DEGREE:
-                raise BadInput("the file is no SPZ of version 2, 3 or 4; export the splats as PLY")
+                raise BadInput("the file is not an SPZ of version 2, 3 or 4; export the splats as PLY")
             _check_count(count, most)
             sizes = (9, 1, 3, 3, 3 if version == 2 else 4)
             sections = (
@@ -114,7 +114,7 @@ def _spz4_sections(content: bytes, streams: int, sizes: list[int]) -> list[bytes
             raise ValueError(f"stream {number} has {unpacked} bytes, expected {size}")
         frame = content[start : start + packed]
         if zstandard.frame_content_size(frame) not in (-1, size):  # -1: not said, and bounded by the next line
-            raise ValueError(f"stream {number} unpacks to more than it should")
+            raise ValueError(f"stream {number} unpacks to more bytes than expected")
         sections.append(zstandard.ZstdDecompressor().decompress(frame, max_output_size=size))
         start += packed
     return sections
@@ -202,7 +202,9 @@ def _cloud(
     if not all(part.isfinite().all() for part in parts):
         raise BadInput("the splats have numbers that are not finite (NaN or infinity); export them again")
     if changed.any():
-        notes += (f"{int(changed.sum())} splats had an extreme opacity or size, or no rotation; they got usable ones",)
+        notes += (
+            f"{int(changed.sum())} splats had an extreme opacity or size, or no rotation; these values were replaced",
+        )
     return Gaussians(parts[0], parts[1], parts[2], parts[3][:, 0], parts[4][:, None]), notes
 
 

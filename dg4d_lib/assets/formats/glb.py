@@ -4,7 +4,7 @@ A tracked mesh becomes one mesh whose base is frame 0, with a morph target per f
 components as morph targets. Very long animations, and textures per frame in core glTF, are split into several nodes
 that share all other data. Meshes per frame become one node each, shown and hidden by its scale. All items are named.
 The baked color is the base color of a rough dielectric. `largestError` in the extras of the root node bounds the errors
-of vertices along each axis, world units.
+of vertices along each axis, in the units of the file.
 """
 
 import io
@@ -26,6 +26,7 @@ from dg4d_lib.assets.formats.foreign_nodes import global_matrices
 from dg4d_lib.assets.formats.gltf import MAX_POSES, GlbReader, GltfDocument
 from dg4d_lib.assets.formats.materials import WEBP, Atlas, add_material, add_texture, to_uint8
 from dg4d_lib.assets.formats.morph_components import fit_components, principal_components
+from dg4d_lib.assets.formats.normals import mesh_normal_groups
 from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
 from dg4d_lib.assets.formats.tracks import Animation, Span, split_into_spans
 from dg4d_lib.errors import BadInput
@@ -55,7 +56,7 @@ def write_glb(asset: Asset4D, settings: GltfSettings = DEFAULTS) -> bytes:
         animation.add_pointer(OFFSET_POINTER, "texture offset", atlas.offsets())
     materials = _add_materials(document, asset, atlas, settings)
     cube = quantization_cube([_floats(asset.mesh.vertices)], offsets, settings)
-    shape = _add_shape(document, NAME, asset.mesh, cube, atlas)
+    shape = _add_shape(document, NAME, asset.mesh, offsets, cube, atlas)
     if settings.components and len(materials) == 1:
         node = _add_components(document, animation, shape, materials[0], offsets, settings)
         animation.finish()
@@ -172,15 +173,22 @@ def read_mesh_glb(content: bytes) -> TexturedMesh:
         ) from error
 
 
-def component_notes(name: str, content: bytes) -> tuple[str, ...]:
-    """Return a note on the error of the principal components in a file of `write_glb`; none if it has frames."""
+def component_notes(name: str, content: bytes, meters_per_unit: float = 1.0) -> tuple[str, ...]:
+    """Return a note on the error of the principal components in a file of `write_glb`; none if it has frames.
+
+    Args:
+        name: of the file.
+        content: the file.
+        meters_per_unit: scale of the asset, meters per world unit of the fit; the note gives distances in world units.
+    """
     tree = GlbReader(content).tree
     errors = tree["nodes"][tree["scenes"][0]["nodes"][0]].get("extras", {})
     if "rmsError" not in errors:
         return ()
+    rms, largest = errors["rmsError"] / meters_per_unit, errors["largestError"] / meters_per_unit
     return (
-        f"{name} misses the motion by {errors['rmsError']:.2g} world units (rms), at most "
-        f"{errors['largestError']:.2g}, by its principal components (pack.gltf.components)",
+        f"{name} misses the motion by {rms:.2g} world units (rms), at most {largest:.2g}, by its principal components "
+        "(pack.gltf.components)",
     )
 
 
@@ -295,16 +303,23 @@ def _add_mesh(
 ) -> int:
     """Add a static mesh with its material; return its index."""
     texture = add_texture(document, name, to_uint8(mesh.texture), settings)
-    shape = _add_shape(document, name, mesh, cube)
+    shape = _add_shape(document, name, mesh, np.zeros((1, 1, 3), np.float32), cube)
     primitive = _primitive(shape, add_material(document, name, texture, settings))
     return document.add("meshes", name=name, primitives=[primitive])
 
 
 def _add_shape(
-    document: GltfDocument, name: str, mesh: TexturedMesh, cube: QuantizationCube | None, atlas: Atlas | None = None
+    document: GltfDocument,
+    name: str,
+    mesh: TexturedMesh,
+    offsets: NDArray[np.float32],
+    cube: QuantizationCube | None,
+    atlas: Atlas | None = None,
 ) -> MeshPrimitive:
     uvs = _floats(mesh.uvs) if atlas is None else atlas.to_atlas_uvs(_floats(mesh.uvs))
-    return MeshPrimitive(document, name, _floats(mesh.vertices), mesh.faces.cpu().numpy(), uvs, cube)
+    vertices = _floats(mesh.vertices)
+    groups = mesh_normal_groups(mesh, vertices + offsets)
+    return MeshPrimitive(document, name, vertices, mesh.faces.cpu().numpy(), uvs, cube, groups)
 
 
 def _primitive(shape: MeshPrimitive, material: int) -> dict[str, Any]:

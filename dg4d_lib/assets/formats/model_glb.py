@@ -42,7 +42,7 @@ def write_model_glb(model: Model) -> bytes:
 
 
 def _numbers(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return float32; what is no number or too large would break the file, and becomes 0 or the largest one."""
+    """Convert to float32; NaN becomes 0 and values out of range are clamped."""
     with np.errstate(over="ignore"):
         return np.nan_to_num(values.astype("<f4"))
 

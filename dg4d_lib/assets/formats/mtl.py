@@ -25,7 +25,7 @@ def read_mtl(text: str) -> dict[str, Material]:
     """Return the materials of an MTL by name.
 
     Raises:
-        ValueError: a color is no number.
+        ValueError: a color is not a number.
     """
     current, materials = Material(), {}
     for line in text.splitlines():

@@ -60,8 +60,8 @@ def read_elements(content: bytes, needed: Collection[str]) -> dict[str, Element]
     """Read the elements of a PLY up to the last needed one.
 
     Raises:
-        ValueError, IndexError, OverflowError: the file is no PLY, it is broken or truncated, or an element has too many
-            rows of different lengths.
+        ValueError, IndexError, OverflowError: the file is not a PLY, it is broken or truncated, or an element has too
+            many rows of different lengths.
     """
     end = content.index(b"end_header")
     start = content.index(b"\n", end) + 1
@@ -134,11 +134,11 @@ class _Numbers:
 
     def __init__(self, text: bytes) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # says that something is no number
+            warnings.simplefilter("error", DeprecationWarning)  # says that something is not a number
             try:
                 self.numbers = np.fromstring(text.decode("ascii", "replace"), np.float64, sep=" ")
             except DeprecationWarning as error:
-                raise ValueError("a row has something that is no number") from error
+                raise ValueError("a row has something that is not a number") from error
         self.place = 0
 
     def take(self, count: int) -> NDArray[np.float64]:

@@ -3,15 +3,16 @@
 Quantization (KHR_mesh_quantization) uses 8 bits for normals and 16 bits for positions, 14 of them in compressed files.
 Positions are integer points of a cube around all poses, and the node's transform scales the cube: plain integers, not
 fractions of the largest one, because some readers ignore that flag of an accessor. For the same reason texture
-coordinates are float32 unless the file is compressed. A position and its displacement are rounded together, so vertices
-moved by one morph target are as exact as those of the base: half a step of the cube on each axis. Errors of principal
-components, of which several are added, are measured. Morph targets of normals must lie in [-1, 1]; where a change is
-larger, the target is a shorter normal of the right direction, which players normalize. Poses in which many normals have
-turned too far for that have 16 bits, or float32.
+coordinates are float32 unless the file is compressed. Positions of skinned meshes are float32. A position and its
+displacement are rounded together, so vertices moved by one morph target are as exact as those of the base: half a step
+of the cube on each axis. Errors of principal components, of which several are added, are measured. Morph targets of
+normals must lie in [-1, 1]; where a change is larger, the target is a shorter normal of the right direction, which
+players normalize. Poses in which many normals have turned too far for that have 16 bits, or float32.
 """
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,11 @@ class QuantizationCube:
         """Round positions to integer points of the cube; those of positions outside exceed `steps`."""
         return np.rint((positions - self.center) / self.step).astype(np.int32)
 
+    def round(self, positions: Floats) -> Floats:
+        """Round positions to a grid as fine as the cube's, of a power of two: float32 with few bits compress well."""
+        step = 2.0 ** math.floor(math.log2(self.step))
+        return (np.rint(positions / step) * step).astype(np.float32)
+
     def node_transform(self) -> dict[str, list[float]]:
         """Return the node properties that map integer points to the world."""
         return {"translation": self.center.tolist(), "scale": [self.step] * 3}
@@ -100,7 +106,7 @@ def reorder_mesh(mesh: TexturedMesh) -> tuple[TexturedMesh, Int[Tensor, " v"]]:
         BackendUnavailable: meshoptimizer is missing.
     """
     order, faces = map(torch.from_numpy, order_for_compression(mesh.faces.cpu().numpy(), len(mesh.vertices)))
-    return replace(mesh, vertices=mesh.vertices[order], faces=faces, uvs=mesh.uvs[order]), order
+    return mesh.select(order, faces), order
 
 
 class MeshPrimitive:
@@ -119,6 +125,9 @@ class MeshPrimitive:
         faces: NDArray[np.integer[Any]],
         uvs: Floats,
         cube: QuantizationCube | None,
+        groups: NDArray[np.integer[Any]],
+        *,
+        skinned: bool = False,
     ) -> None:
         """Add a mesh in its base pose.
 
@@ -129,14 +138,18 @@ class MeshPrimitive:
             faces: indices into the vertices.
             uvs: texture coordinates in [0, 1].
             cube: for quantized positions; None for float32.
+            groups: of the vertices that share a normal, as `normal_groups` numbers them.
+            skinned: float32 positions also with a cube, because the transform of a node with a skin, which would undo
+                the quantization, has no effect.
         """
         self._document, self._vertices, self._cube = document, vertices, cube
-        self._normals_of = SmoothNormals(vertices, faces)
+        self._normals_of = SmoothNormals(groups, faces)
         self._normals: Floats = self._normals_of(vertices)
         rows: tuple[NDArray[Any], ...] = (vertices, self._normals, uvs)
         if cube is not None:
             document.use_extension(QUANTIZATION, required=True)
-            normals, positions = _normalized(self._normals, _BYTE, "i1"), cube.quantize(vertices).astype("<i2")
+            normals = _normalized(self._normals, _BYTE, "i1")
+            positions = cube.round(vertices) if skinned else cube.quantize(vertices).astype("<i2")
             rows = (positions, normals, uvs)
             if document.compressed:
                 rows = (positions, normals, _normalized(uvs.clip(0, 1), _UNSIGNED_SHORT, "<u2"))

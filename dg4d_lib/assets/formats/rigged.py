@@ -7,6 +7,7 @@ animation loops like that of the morphed mesh. Textures per frame are not writte
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt
 
 from dg4d_lib.asset_settings import GltfSettings
@@ -14,7 +15,8 @@ from dg4d_lib.assets.animated import Asset4D
 from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GltfDocument
 from dg4d_lib.assets.formats.joint_motion import bone_names, close_loop, relative_motion, rest_arms
 from dg4d_lib.assets.formats.materials import add_material, add_texture, to_uint8
-from dg4d_lib.assets.formats.primitives import MeshPrimitive, QuantizationCube, quantization_cube, reorder_mesh
+from dg4d_lib.assets.formats.normals import mesh_normal_groups
+from dg4d_lib.assets.formats.primitives import MeshPrimitive, quantization_cube, reorder_mesh
 from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
@@ -28,13 +30,16 @@ FLOAT = 5126  # glTF component type
 WEIGHT_ONE, QUANTIZED_ONE = 65535, 255  # integer that stands for the weight 1
 
 
-def fit_asset_rig(asset: Asset4D, max_bones: int, max_error: float) -> tuple[Rig | None, str]:
+def fit_asset_rig(
+    asset: Asset4D, max_bones: int, max_error: float, meters_per_unit: float = 1.0
+) -> tuple[Rig | None, str]:
     """Fit a rig to an asset; return it, or None if its error is too large, and a note for the report.
 
     Args:
         asset: the animated mesh.
         max_bones: maximum number of bones, up to 255.
         max_error: largest acceptable `Rig.error`.
+        meters_per_unit: scale of the asset, meters per world unit of the fit; the note gives distances in world units.
 
     Raises:
         BadInput: no vertices, no frames, or numbers that are not finite.
@@ -42,7 +47,8 @@ def fit_asset_rig(asset: Asset4D, max_bones: int, max_error: float) -> tuple[Rig
     rig = fit_rig(asset.mesh.vertices, asset.offsets, TARGET_ERROR, max_bones)
     bones = "1 bone misses" if len(rig.rest_positions) == 1 else f"{len(rig.rest_positions)} bones miss"
     lengths = "bones keep their lengths" if rig.stretch < RIGID else f"bones stretch by up to {rig.stretch:.0%}"
-    figures = f"{bones} {rig.error:.1%} of the motion: {rig.rms:.2g} world units (rms), at most {rig.max_distance:.2g}"
+    rms, largest = rig.rms / meters_per_unit, rig.max_distance / meters_per_unit
+    figures = f"{bones} {rig.error:.1%} of the motion: {rms:.2g} world units (rms), at most {largest:.2g}"
     if rig.error > max_error:
         return None, f"no rig: {figures}; {max_error:.1%} is allowed"
     return rig, f"rig: {figures}; {lengths}"
@@ -69,12 +75,14 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     document = GltfDocument(asset.extras, compressed=settings.meshopt)
     texture = add_texture(document, NAME, to_uint8(mesh.texture), settings)
     material = add_material(document, NAME, texture, settings)
+    states = torch.cat([mesh.vertices[None], mesh.vertices + asset.offsets])
     if settings.meshopt:
         mesh, order = reorder_mesh(mesh)
-        bones, shares = bones[order], shares[order]
+        bones, shares, states = bones[order], shares[order], states[:, order]
     vertices, uvs = (values.detach().cpu().numpy().astype("<f4") for values in (mesh.vertices, mesh.uvs))
     cube = quantization_cube([vertices], (), settings)
-    shape = MeshPrimitive(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, cube)
+    groups = mesh_normal_groups(mesh, states.detach().cpu().numpy())
+    shape = MeshPrimitive(document, NAME, vertices, mesh.faces.cpu().numpy(), uvs, cube, groups, skinned=True)
     weights = _quantize_weights(shares.double().numpy(), WEIGHT_ONE if cube is None else QUANTIZED_ONE)
     joints_of = np.where(weights > 0, bones.numpy(), 0).astype("u1")
     attributes = {
@@ -85,7 +93,7 @@ def write_rigged_glb(asset: Asset4D, rig: Rig, settings: GltfSettings) -> bytes:
     primitive = {"attributes": attributes, "indices": shape.indices, "material": material, "mode": 4}
     number = document.add("meshes", name=NAME, primitives=[primitive])
     skeleton, joints = _add_joints(document, rig)
-    bind_matrices = _add_bind_matrices(document, rig.rest_positions.double().cpu().numpy(), cube)
+    bind_matrices = _add_bind_matrices(document, rig.rest_positions.double().cpu().numpy())
     skin = document.add("skins", name="rig", inverseBindMatrices=bind_matrices, skeleton=skeleton, joints=joints)
     node = document.add("nodes", name=NAME, mesh=number, skin=skin)
     _add_motion(document, rig, joints, asset.fps, settings.interpolation.upper())
@@ -117,16 +125,10 @@ def _add_joints(document: GltfDocument, rig: Rig) -> tuple[int, list[int]]:
     return document.add("nodes", name="skeleton", children=[joints[0]]), joints
 
 
-def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"], cube: QuantizationCube | None) -> int:
-    """Add the inverse bind matrices, from the mesh to every joint at rest; return the accessor's index.
-
-    They also undo quantization, because the transform of a node with a skin has no effect.
-    """
+def _add_bind_matrices(document: GltfDocument, rest: Float[np.ndarray, "b 3"]) -> int:
+    """Add the inverse bind matrices, from the mesh to every joint at rest; return the accessor's index."""
     matrices = np.tile(np.eye(4), (len(rest), 1, 1))
     matrices[:, 3, :3] = -rest  # column-major
-    if cube is not None:
-        matrices[:, :3, :3] *= cube.step
-        matrices[:, 3, :3] += cube.center
     matrices = matrices.astype("<f4")
     view = document.add_view("joints at rest", matrices.tobytes())
     return document.add(

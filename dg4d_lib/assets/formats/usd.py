@@ -23,13 +23,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 from torch import Tensor
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.formats.normals import SmoothNormals
+from dg4d_lib.assets.formats.normals import SmoothNormals, mesh_normal_groups, weld
 from dg4d_lib.assets.formats.usd_materials import add_material, encode_texture
 from dg4d_lib.assets.formats.usd_skeleton import add_skeleton, as_skel_root
 from dg4d_lib.assets.formats.usd_splats import add_splats_variant
@@ -128,10 +127,9 @@ def write_skinned_usdz(
     stage = _new_asset(about, len(asset.offsets), asset.fps)
     as_skel_root(stage, "/asset/mesh")
     UsdGeom.Scope.Define(stage, "/asset/mesh/materials")
-    rest = to_array(asset.mesh.vertices)
-    points, point_of = _weld(rest[None])
-    _, first = np.unique(point_of, return_index=True)
-    mesh = _add_mesh(stage, "subject", asset.mesh, points, point_of, asset.fps, settings)
+    rest, moved = to_array(asset.mesh.vertices), to_array(asset.mesh.vertices + asset.offsets)
+    states = np.concatenate([rest[None], moved])
+    mesh, first = _add_mesh(stage, "subject", asset.mesh, states, None, settings)
     add_skeleton(stage, mesh, rest, first, rig, asset.fps)
     name, content = encode_texture("subject", asset.mesh.texture, settings)
     for file in add_material(stage, mesh, "subject", settings, open_pbr=False):
@@ -157,6 +155,8 @@ class UsdPlacement:
         transform: asset to scene, acts on column vectors.
         start_s: start of the animation, seconds; the asset stands still before.
         speed: playback speed relative to the recording, above 0.
+        hold_s: time in the recording of the pose that the asset holds afterwards, seconds; None: of the last key, which
+            repeats the first frame.
     """
 
     name: str
@@ -164,12 +164,21 @@ class UsdPlacement:
     transform: Float[Tensor, "4 4"]
     start_s: float = 0.0
     speed: float = 1.0
+    hold_s: float | None = None
+
+    @property
+    def source(self) -> tuple[Path, float | None]:
+        """File and last key of what the scene stores, once for all placements that have them in common."""
+        return self.file, self.hold_s
 
 
-def compose_usdz(path: Path, placements: Sequence[UsdPlacement]) -> None:
-    """Write a scene of several assets as USDZ; every file is stored once, however often it is placed.
+def compose_usdz(path: Path, placements: Sequence[UsdPlacement], duration_s: float | None = None) -> None:
+    """Write a scene of several assets as USDZ; every file is stored once for all placements with the same `hold_s`.
 
-    The scene ends with the last asset; finished assets stand still.
+    Args:
+        path: output file, `.usdz`.
+        placements: assets in space and time; finished assets stand still.
+        duration_s: duration of the scene, seconds, above 0; None: until the last asset has played once.
 
     Raises:
         BadInput: no placements, a file that is not a USDZ with a default prim, or an invalid time, speed or transform.
@@ -179,22 +188,23 @@ def compose_usdz(path: Path, placements: Sequence[UsdPlacement]) -> None:
         raise BadInput("a scene needs at least one asset; given none")
     for placement in placements:
         _check_placement(placement)
-    packages = {placement.file: UsdzPackage(placement.file) for placement in placements}
-    end_s = max(p.start_s + packages[p.file].duration_s / p.speed for p in placements)
-    stage = new_stage("/scene", "assembly", "scene", end_s * TIME_CODES_PER_SECOND)
+    packages = {source: UsdzPackage(*source) for source in dict.fromkeys(p.source for p in placements)}
+    if duration_s is None:
+        duration_s = max(p.start_s + packages[p.source].duration_s / p.speed for p in placements)
+    stage = new_stage("/scene", "assembly", "scene", duration_s * TIME_CODES_PER_SECOND)
     names = _identifiers([placement.name for placement in placements])
     named = list(zip(placements, names, strict=True))
-    folders = {placement.file: name for placement, name in reversed(named)}  # the first name of every file
+    folders = {placement.source: name for placement, name in reversed(named)}  # the first name of every source
     for placement, name in named:
         xform = UsdGeom.Xform.Define(stage, f"/scene/{name}")
         xform.AddTransformOp().Set(Gf.Matrix4d(placement.transform.T.tolist()))  # USD transforms row vectors
         xform.GetPrim().SetDisplayName(placement.name)
-        layer = f"./{folders[placement.file]}/{packages[placement.file].layer}"
+        layer = f"./{folders[placement.source]}/{packages[placement.source].layer}"
         offset = Sdf.LayerOffset(placement.start_s * TIME_CODES_PER_SECOND, 1 / placement.speed)
         xform.GetPrim().GetPayloads().AddPayload(layer, Sdf.Path(), offset)
     files = {
-        f"{folders[file]}/{name}": content
-        for file, package in packages.items()
+        f"{folders[source]}/{name}": content
+        for source, package in packages.items()
         for name, content in package.files.items()
     }
     write_usdz_package(path, stage, "scene.usdc", files)
@@ -238,8 +248,8 @@ def _add_tracked(
     stage: Usd.Stage, asset: Asset4D, fps: float, settings: GltfSettings, open_pbr: bool
 ) -> dict[str, bytes]:
     """Define a tracked mesh; return its images by name in the package."""
-    points, point_of = _weld(to_array(asset.mesh.vertices + asset.offsets))
-    mesh = _add_mesh(stage, "subject", asset.mesh, points, point_of, fps, settings)
+    states = to_array(asset.mesh.vertices + asset.offsets)
+    mesh, _ = _add_mesh(stage, "subject", asset.mesh, states, fps, settings)
     files = add_material(stage, mesh, "subject", settings, open_pbr)
     if asset.textures is None:
         pictures = [encode_texture("subject", asset.mesh.texture, settings)]
@@ -259,8 +269,7 @@ def _add_frames(
     pictures = {}
     for frame, textured in enumerate(meshes):
         name = f"frame_{frame:03d}"
-        points, point_of = _weld(to_array(textured.vertices[None]))
-        mesh = _add_mesh(stage, name, textured, points, point_of, fps, settings)
+        mesh, _ = _add_mesh(stage, name, textured, to_array(textured.vertices[None]), None, settings)
         _empty_except_at(mesh, frame, len(meshes), fps)
         file, content = encode_texture(name, textured.texture, settings)
         for attribute in add_material(stage, mesh, name, settings, open_pbr):
@@ -273,25 +282,29 @@ def _add_mesh(
     stage: Usd.Stage,
     name: str,
     textured: TexturedMesh,
-    points: Float[np.ndarray, "t p 3"],
-    point_of: Int[np.ndarray, " v"],
-    fps: float,
+    states: Float[np.ndarray, "t v 3"],
+    fps: float | None,
     settings: GltfSettings,
-) -> UsdGeom.Mesh:
+) -> tuple[UsdGeom.Mesh, Int[np.ndarray, " p"]]:
     """Define a mesh with a pose per frame, or with a single pose that is not animated.
 
     Args:
         stage: stage to extend.
         name: name of the prim.
-        textured: triangles and texture coordinates.
-        points: positions of the points at every frame.
-        point_of: point of every vertex.
-        fps: frames per second.
+        textured: triangles, texture coordinates and smoothing groups.
+        states: vertices in every pose; those that coincide in all poses and share a normal become one point.
+        fps: frames per second; None to write the first pose only.
         settings: moving_normals.
+
+    Returns:
+        The mesh, and the vertex of every point.
     """
     corners = textured.faces.cpu().numpy()
+    groups = mesh_normal_groups(textured, states)
+    first, point_of = weld(states, groups)
+    points = states[: None if fps is not None else 1, first]
     faces = point_of[corners]
-    normals_of = SmoothNormals(points[0], faces)
+    normals_of = SmoothNormals(groups[first], faces)
     mesh = UsdGeom.Mesh.Define(stage, f"/asset/mesh/{name}")
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
@@ -305,23 +318,14 @@ def _add_mesh(
         (mesh.CreateNormalsAttr(), [vectors(normals_of(pose)) for pose in poses]),
     ):
         attribute.Set(values[0])
-        if len(values) > 1:
+        if fps is not None and len(values) > 1:
             animate(attribute, values, fps)
     kind, per_corner = Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, per_corner)
     u, v = to_array(textured.uvs).T
     st.Set(Vt.Vec2fArray.FromNumpy(np.stack((u, 1 - v), axis=1)))  # in USD, v points up
     st.SetIndices(integers(corners))
-    return mesh
-
-
-def _weld(states: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Merge vertices that coincide in all states; return the points "t p 3" and the point of every vertex."""
-    paths = np.ascontiguousarray(states.swapaxes(0, 1).reshape(states.shape[1], -1)) + 0.0  # turns -0 into 0
-    keys = paths.view(f"V{paths.itemsize * paths.shape[1]}")[:, 0]
-    _, first, group = np.unique(keys, return_index=True, return_inverse=True)
-    kept, point_of_group = np.unique(first, return_inverse=True)  # sorted by vertex index
-    return paths[kept].reshape(len(kept), *states.shape[::2]).swapaxes(0, 1), point_of_group[group]
+    return mesh, first
 
 
 def _empty_except_at(mesh: UsdGeom.Mesh, frame: int, frames: int, fps: float) -> None:

@@ -25,7 +25,7 @@ _BROKEN = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, 
 
 
 def check_usdz(path: Path) -> None:
-    """Refuse zips that are no USDZ: compressed or overlapping entries, or too many.
+    """Refuse zips that are not USDZ: compressed or overlapping entries, or too many.
 
     Raises:
         BadInput: says why.
@@ -40,8 +40,8 @@ def check_usdz(path: Path) -> None:
     size, inside = path.stat().st_size, sum(entry.file_size for entry in entries)
     if len(entries) > MAX_ENTRIES or inside > size:
         raise BadInput(
-            f"the USDZ says that it holds {len(entries)} files of {inside} bytes, and has {size} bytes itself; at most "
-            f"{MAX_ENTRIES} files are read, none twice: export it again"
+            f"the USDZ declares {len(entries)} files with {inside} bytes in {size} bytes of archive; at most "
+            f"{MAX_ENTRIES} files without overlap are read: export it again"
         )
 
 
@@ -76,7 +76,7 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         upright = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     parts: list[ModelPart] = []
-    others: list[str] = []  # visible objects that are no meshes
+    others: list[str] = []  # visible objects that are not meshes
     faces, materials = 0, UsdMaterials(package, decode)
     for number, prim in enumerate(stage.Traverse(Usd.TraverseInstanceProxies())):
         if number >= MAX_PRIMS:
@@ -103,20 +103,20 @@ def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:
 
 
 def _left_out(objects: list[str]) -> list[str]:
-    """Return a note about objects that are no meshes."""
+    """Return a note about objects that are not meshes."""
     if not objects:
         return []
-    return [f"objects of the USD file that are no meshes were left out: {listed(objects, MOST_NAMED)}"]
+    return [f"objects of the USD file that are not meshes were left out: {listed(objects, MOST_NAMED)}"]
 
 
 def _no_mesh(stage: Usd.Stage) -> str:
-    """Return what to do about a file without triangles."""
+    """Return the error message for a file without triangles."""
     if any(prim.IsA(UsdVol.ParticleField) for prim in stage.Traverse()):
         return (
-            "the USD file shows splats and no mesh; splats are read from PLY and SPZ: give one of these, such as "
+            "the USD file contains splats and no mesh; splats are read from PLY and SPZ: give one of these, such as "
             "splats/000.ply of a dg4d package, or its mesh, asset.usdz"
         )
-    return "the USD file shows no triangles; give a mesh with faces"
+    return "the USD file contains no triangles; give a mesh with faces"
 
 
 def _is_rendered(prim: UsdGeom.Imageable, time: Any) -> bool:

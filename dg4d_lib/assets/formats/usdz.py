@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pxr import Tf, Usd
+from pxr import Sdf, Tf, Usd
 
 from dg4d_lib.errors import BadInput
 
@@ -15,6 +15,7 @@ ALIGNMENT = 64  # bytes; alignment of every file's content (USDZ specification)
 HEADER = 30  # bytes of a local file header before the name
 EXTRA_HEADER = 4  # bytes of an extra field before its content
 PADDING = 0x1986  # id of the extra field that OpenUSD uses for padding
+SAME_KEY = 0.01  # time codes, below the distance of any two keys; times of a GLB have single precision
 UNIX = 3  # "created by" system of the zip, fixed so that all platforms write equal bytes
 
 
@@ -31,9 +32,7 @@ def write_usdz_package(path: Path, stage: Usd.Stage, layer: str, files: Mapping[
         OSError: the file could not be written.
     """
     with TemporaryDirectory() as scratch:
-        file = Path(scratch) / layer
-        stage.GetRootLayer().Export(str(file))
-        entries = {layer: file.read_bytes(), **files}
+        entries = {layer: _encode(stage.GetRootLayer(), Path(scratch) / layer), **files}
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as package:
         for name, data in entries.items():
@@ -55,8 +54,12 @@ class UsdzPackage:
         duration_s: time of the last time code, seconds.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, hold_s: float | None = None) -> None:
         """Read a USDZ.
+
+        Args:
+            path: of the file.
+            hold_s: time of the last key that is kept, seconds; readers hold its pose afterwards. None: all keys.
 
         Raises:
             BadInput: the file is missing, not a USDZ, or has no default prim.
@@ -74,3 +77,25 @@ class UsdzPackage:
         self.layer = next(iter(self.files))
         self.fps: float = stage.GetTimeCodesPerSecond()
         self.duration_s: float = stage.GetEndTimeCode() / self.fps
+        if hold_s is not None:
+            self.files[self.layer] = _layer_until(stage.GetRootLayer(), hold_s * self.fps, self.layer)
+
+
+def _layer_until(layer: Sdf.Layer, end: float, name: str) -> bytes:
+    """Encode a layer without the keys after a time code."""
+    shortened = Sdf.Layer.CreateAnonymous(name)
+    shortened.TransferContent(layer)
+    paths: list[Sdf.Path] = []
+    shortened.Traverse(Sdf.Path.absoluteRootPath, paths.append)
+    for path in paths:
+        for key in shortened.ListTimeSamplesForPath(path):
+            if key > end + SAME_KEY:
+                shortened.EraseTimeSample(path, key)
+    with TemporaryDirectory() as scratch:
+        return _encode(shortened, Path(scratch) / name)
+
+
+def _encode(layer: Sdf.Layer, file: Path) -> bytes:
+    """Write a layer to a file and return its content."""
+    layer.Export(str(file))
+    return file.read_bytes()

@@ -2,7 +2,8 @@
 
 Vertices, images, materials and extensions are copied unchanged; data of a file that is used twice is stored once. Every
 asset is the child of a node with its name. A single animation of the scene's duration moves all assets, because players
-play one animation at a time. An asset shows its first frame until it starts, and its last key after its end.
+play one animation at a time. An asset shows its first frame until it starts. One that does not loop plays once, without
+the return to the first frame that ends its animation, and stands in its last pose from then on.
 """
 
 import math
@@ -40,10 +41,16 @@ class AnimatedGlb:
         box_max: upper corner of the bounding box over all frames, meters.
         foot: standing point: below the center of the box, at the lowest point of the first frame.
         duration_s: duration of the animation, seconds; 0 if there is none.
+        last_pose_s: time of the last key before the return to the first frame, seconds.
     """
 
-    def __init__(self, content: bytes) -> None:
+    def __init__(self, content: bytes, return_s: float = 0.0) -> None:
         """Parse a GLB.
+
+        Args:
+            content: the file.
+            return_s: duration of the return to the first frame at the end of the animation, seconds; it takes at least
+                the time between the last two keys.
 
         Raises:
             BadInput: the file is not a GLB, has no mesh, or has a layout that dg4d does not write.
@@ -60,7 +67,10 @@ class AnimatedGlb:
             self.box_max: Vector = np.max([pose.max(0) for pose in poses], axis=0)
             middle = (self.box_min + self.box_max) / 2
             self.foot: Vector = np.array((middle[0], poses[0][:, 1].min(), middle[2]))
-            self.duration_s = max((float(self.file.accessor(s["input"])[-1, 0]) for s in self._samplers), default=0.0)
+            keys = np.concatenate([np.zeros(1), *(self.file.accessor(s["input"])[:, 0] for s in self._samplers)])
+            self.duration_s = float(keys.max())
+            before = keys <= self.duration_s - max(return_s - SHORTEST_S, SHORTEST_S)
+            self.last_pose_s = float(keys[before].max(initial=0.0))
         except _FOREIGN as error:
             raise BadInput(
                 f"this GLB is not an animated asset ({error!r}); give an asset that `dg4d make` wrote"
@@ -170,7 +180,7 @@ class Actor:
         played = (times_s - self.item.start_s).clip(0) * self.item.speed
         if self.item.loop and self.glb.duration_s > 0:
             return played % self.glb.duration_s
-        return played.clip(max=self.glb.duration_s)
+        return played.clip(max=self.glb.duration_s if self.item.loop else self.glb.last_pose_s)
 
 
 def line_up(glbs: Sequence[AnimatedGlb], spacing: float) -> list[tuple[float, float, float]]:
@@ -347,6 +357,9 @@ def _retime(
     if interpolation == "CUBICSPLINE":
         raise BadInput(f"{actor.name} is animated by cubic splines, which scenes do not support; use asset.glb")
     period, speed = actor.glb.duration_s, actor.item.speed
+    if not actor.item.loop:
+        played = keys <= max(actor.glb.last_pose_s + SHORTEST_S, keys[0])
+        keys, rows = keys[played], rows[played]
     keys, rows = _cover_period(keys, rows, period)
     loops = math.ceil((length - actor.item.start_s) * speed / period) if actor.item.loop else 1
     if loops > MAX_LOOPS:

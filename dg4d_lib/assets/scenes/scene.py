@@ -25,7 +25,9 @@ class SceneItem(Settings):
     scale: Positive = Field(1.0, le=1e6)
     start_s: NotNegative = Field(0.0, description="start of its animation, seconds; it stands still before")
     speed: Positive = Field(1.0, le=1e3, description="playback speed relative to the recording")
-    loop: bool = Field(True, description="true: loops until the scene ends; false: plays once")
+    loop: bool = Field(
+        True, description="true: loops until the scene ends; false: plays once, then stands in its last pose"
+    )
 
 
 class Scene(Settings):

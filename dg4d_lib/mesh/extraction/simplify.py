@@ -6,7 +6,6 @@ stay exactly as they were, and all levels share one texture. The motion of a ver
 """
 
 from ctypes import c_float, c_size_t
-from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -74,8 +73,7 @@ def simplify_mesh(
     used, faces = np.unique(kept[:count], return_inverse=True)
     remaining = torch.from_numpy(used.astype(np.int64)).to(mesh.vertices.device)
     corners = torch.from_numpy(faces.reshape(-1, 3)).to(mesh.faces)
-    reduced = replace(mesh, vertices=mesh.vertices[remaining], faces=corners, uvs=mesh.uvs[remaining])
-    return reduced, offsets[:, remaining]
+    return mesh.select(remaining, corners), offsets[:, remaining]
 
 
 def _motion_modes(offsets: Float[Tensor, "t v 3"]) -> NDArray[np.float64]:

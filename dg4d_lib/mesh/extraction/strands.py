@@ -30,7 +30,7 @@ SLENDER = 4.0  # length of a strand, in its radii, at least
 MARGIN = 16  # pixels around what is not covered
 REACH = 48.0  # pixels from the root of a strand to the vertex that it grows out of
 ROUNDS = 4  # branches of a strand grow in the round after it
-MOST = 16  # strands that are tried in a round, the longest ones: fringes of a cut-out are no legs
+MOST = 16  # strands that are tried in a round, the longest ones: fringes of a cut-out are not legs
 SMOOTH = 4.0  # standard deviation of the middle line along its pixels
 THINNEST = 2.0  # pixels of radius
 TIP = 6  # pixels of the middle line that show where it goes on
@@ -193,7 +193,7 @@ def with_strand(grown: Grown, strand: Strand) -> Grown | None:
 
 
 def _ring(faces: Int[np.ndarray, "f 3"], base: int) -> Int[np.ndarray, " n"] | None:
-    """Return the neighbors of a vertex, counter-clockwise seen from outside; None if they are no ring."""
+    """Return the neighbors of a vertex, counter-clockwise seen from outside; None if they are not a ring."""
     following = {}
     for face in faces[(faces == base).any(1)]:
         k = int(np.flatnonzero(face == base)[0])

@@ -66,11 +66,13 @@ def merge_parts(model: Model, texture_size: int) -> tuple[TexturedMesh, Int[Tens
         count += len(source)
     order = torch.from_numpy(np.concatenate(sources))
     vertices = torch.from_numpy(model.vertices.astype(np.float32))[order]
+    groups = model.smoothing_groups
     mesh = TexturedMesh(
         vertices,
         torch.from_numpy(np.concatenate(faces)),
         torch.from_numpy(np.concatenate(uvs).astype(np.float32)),
         torch.from_numpy(picture).float() / 255,
+        None if groups is None else torch.from_numpy(groups)[order],
     )
     return mesh, order
 

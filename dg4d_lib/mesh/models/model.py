@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.mesh.extraction.topology import group_vertices
 
 OPAQUE = 128  # alpha of a texel, of 255, from which a masked material is opaque
 TRANSPARENT = "the materials of the model are transparent everywhere; give it an opaque one"
+EQUAL_NORMALS = 1e-3  # side of the cells in which unit normals count as equal
 FAR = 100  # distance from the origin, in sizes of a model, from which float32 rounds it by more than 1e-5 of its size
 
 
@@ -52,6 +54,7 @@ class ModelPart:
         colors: linear color per vertex; None for white.
         masked: True if the alpha of the texture cuts holes.
         wrap: wrap modes of the texture outside [0, 1].
+        normals: unit normals at rest, which tell hard edges from smooth ones; None where all are smooth.
     """
 
     name: str
@@ -63,6 +66,7 @@ class ModelPart:
     colors: Float[np.ndarray, "v 3"] | None = None
     masked: bool = False
     wrap: Wraps = REPEATED
+    normals: Float[np.ndarray, "v 3"] | None = None
 
     def sample(
         self, faces: Int[np.ndarray, " n"], barycentrics: Float[np.ndarray, "n 3"]
@@ -99,6 +103,14 @@ class Model:
         return np.concatenate([part.vertices for part in self.parts])
 
     @property
+    def smoothing_groups(self) -> Int[np.ndarray, " v"] | None:
+        """Smoothing groups of all vertices, as in `TexturedMesh`; None without normals."""
+        if all(part.normals is None for part in self.parts):
+            return None
+        rows = [np.zeros((len(part.vertices), 3)) if part.normals is None else part.normals for part in self.parts]
+        return group_vertices(np.concatenate(rows), EQUAL_NORMALS)[1]
+
+    @property
     def faces(self) -> Int[np.ndarray, "f 3"]:
         """Triangles of all parts, as indices into `vertices`."""
         starts = np.cumsum([0, *(len(part.vertices) for part in self.parts)])
@@ -121,10 +133,31 @@ class Model:
         return replace(
             self,
             parts=tuple(
-                replace(part, vertices=(part.vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32))
+                replace(
+                    part,
+                    vertices=(part.vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32),
+                    normals=None if part.normals is None else transform_normals(matrix[None], part.normals),
+                )
                 for part in self.parts
             ),
         )
+
+
+def transform_normals(
+    matrices: Float[np.ndarray, "#v 4 4"], normals: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """Return unit normals of a surface after affine transforms of its vertices; 0 where there is none.
+
+    Args:
+        matrices: one for all vertices, or one per vertex.
+        normals: of any length.
+    """
+    x, y, z = np.moveaxis(matrices[:, :3, :3], 2, 0)
+    with np.errstate(all="ignore"):
+        cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], -1)
+        cofactors *= np.sign(np.sum(x * cofactors[..., 0], -1))[:, None, None]  # inverse transpose, up to its length
+        moved = np.sum(cofactors * normals[:, None].astype(np.float64), -1)
+        return np.nan_to_num(moved / np.linalg.norm(moved, axis=1, keepdims=True), posinf=0.0, neginf=0.0)
 
 
 def single_precision(parts: Sequence[ModelPart], notes: Sequence[str] = ()) -> Model:

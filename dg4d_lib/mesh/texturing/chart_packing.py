@@ -5,6 +5,7 @@ in which its center then lies lowest. Several orders are tried. Charts are turne
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -88,13 +89,16 @@ class _Chart:
         self.area = float((sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2)
         upright = _tightest_turn(points)
         self.turned = [_turn(points, upright + angle) for angle in 2 * np.pi * np.arange(turns) / turns]
-        self.known: dict[float, list[_Shape]] = {}
+        self.scale, self.known = 0.0, dict[int, _Shape]()  # of the last scale: a packing returns to no earlier one
 
-    def shapes(self, scale: float) -> list["_Shape"]:
-        """Return the cells that the chart occupies in every turn at a scale, cells per unit."""
-        if scale not in self.known:
-            self.known[scale] = [_Shape(points * scale, self.faces, self.gap) for points in self.turned]
-        return self.known[scale]
+    def shapes(self, scale: float, stride: int) -> Iterator["_Shape"]:
+        """Yield the cells that the chart occupies in every `stride`-th turn at a scale, cells per unit."""
+        if scale != self.scale:
+            self.scale, self.known = scale, {}
+        for turn in range(0, len(self.turned), stride):
+            if turn not in self.known:
+                self.known[turn] = _Shape(self.turned[turn] * scale, self.faces, self.gap)
+            yield self.known[turn]
 
 
 class _Shape:
@@ -147,7 +151,7 @@ def _place(charts: list[_Chart], grid: int, gap: int, scale: float, stride: int)
     placed: Placed = []
     for chart in charts:
         lowest: tuple[float, int, int, _Shape] | None = None
-        for shape in chart.shapes(scale)[::stride]:
+        for shape in chart.shapes(scale, stride):
             last = grid - shape.height
             if lowest is not None:
                 last = min(last, int(lowest[0] - shape.center))

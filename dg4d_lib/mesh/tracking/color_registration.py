@@ -1,6 +1,6 @@
 """Registration of a textured mesh to the colors of the driving video, by optical flow.
 
-Outlines say nothing about a face that turns or an arm before the body. The flow from a render of the mesh to the frame
+Outlines do not show a face that turns or an arm in front of the body. The flow from a render of the mesh to the frame
 moves the vertices that the input view shows; the others follow by an as-rigid-as-possible energy.
 """
 

@@ -3,7 +3,7 @@
 Tracking loses what is a pixel wide, so the mesh is tracked without strands. In every frame, a strand is shifted by the
 surface around its root first, and then turns, stretches and bends to the middle lines that the picture shows there.
 How far it comes towards the camera no picture tells: of some slopes, it gets the one at which it crosses the least.
-A strand that most frames do not show is none: seen from the side, wings and hands are lines, too.
+A strand that most frames do not show is dropped: seen from the side, wings and hands are lines, too.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
 """Separation of parts that a motion has pushed into each other, such as an arm that sinks into the body.
 
-A video does not tell how far away an arm before a body is, so tracking puts it inside. First, parts are pushed apart,
-in all frames together and almost only along the rays of the input camera, which leaves its picture as it is but for
-what hides what. Where that does not help, what lies inside another part shrinks back to a cap over the place where it
-enters.
+A video does not show the distance between a body and an arm in front of it, so tracking puts the arm inside. First,
+parts are pushed apart, in all frames together and almost only along the rays of the input camera, which leaves its
+picture as it is but for occlusions. Where that does not help, what lies inside another part shrinks back to a cap over
+the place where it enters.
 """
 
 from collections.abc import Callable

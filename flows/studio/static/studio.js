@@ -84,7 +84,7 @@ document.addEventListener("click", (event) => {
   attempt(async () => {
     const answer = await post(path, button.dataset.again ? JSON.parse(button.dataset.again) : {});
     if (button.dataset.again || "follow" in button.dataset) location.assign(answer.address);
-    else say("Asked for.");
+    else say("Request sent.");
   }, button);
 });
 
@@ -434,7 +434,7 @@ class Editor {
     const text = find("#films-text");
     if (!text || this.kind !== "picture") return;
     const asked = (this.filmsAsked = (this.filmsAsked ?? 0) + 1);
-    text.textContent = "Making the films of the motions …";
+    text.textContent = "Rendering the preview clips …";
     try {
       await this.sendMask();
       const profile = find("[name=profile]").value;
@@ -448,7 +448,7 @@ class Editor {
       }
       text.textContent = films.length ? "" : "The motion comes from the file, or from the model of this profile.";
     } catch (error) {
-      if (asked === this.filmsAsked) text.textContent = `No films: ${error.message}`;
+      if (asked === this.filmsAsked) text.textContent = `The clips could not be rendered: ${error.message}`;
     }
   }
 

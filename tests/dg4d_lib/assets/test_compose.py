@@ -116,20 +116,39 @@ def test_an_asset_moves_where_it_was_placed_and_begins_again(seconds: float, pos
 
 
 @pytest.mark.parametrize(
-    ("seconds", "position"), [(0.1, 0.0), (0.2, 0.0), (0.2625, 1.0), (0.325, 2.0), (0.45, 0.0), (2.0, 0.0)]
+    ("seconds", "position"),
+    [(0.1, 0.0), (0.2, 0.0), (0.2625, 1.0), (0.325, 2.0), (0.3875, 3.0), (0.42, 3.0), (2.0, 3.0)],
 )
-def test_an_asset_waits_plays_once_at_its_speed_and_stands_still(seconds: float, position: float) -> None:
+def test_an_asset_waits_plays_once_at_its_speed_and_stands_in_its_last_pose(seconds: float, position: float) -> None:
     one = actor("one", tracked(), start_s=0.2, speed=2.0, loop=False)
     file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 2.0))
     np.testing.assert_allclose(shown_at(file, "one", seconds), expected_at(one, position), atol=2e-5)
 
 
-def test_the_times_of_an_actor_are_those_of_its_track() -> None:
-    one = actor("one", tracked(), start_s=0.2, speed=2.0)
+@pytest.mark.parametrize("loop", [True, False])
+def test_the_times_of_an_actor_are_those_of_its_track(loop: bool) -> None:
+    one = actor("one", tracked(), start_s=0.2, speed=2.0, loop=loop)
     file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 1.5))
     for seconds in (0.1, 0.21, 0.4, 0.77, 1.1):
         (played,) = one.animation_times(np.array([seconds]))
         np.testing.assert_allclose(shown_at(file, "one", seconds), expected_at(one, played * FPS), atol=2e-5)
+
+
+def test_the_last_pose_is_not_on_the_way_back_to_the_first() -> None:
+    body = AnimatedGlb(write_glb(hopping(4 * FRAMES), SETTINGS["plain"]), return_s=4 / FPS)  # 4 keys per frame
+    assert body.last_pose_s == pytest.approx(4 * (FRAMES - 1) / FPS)
+    one = actor("one", body, loop=False)
+    (played,) = one.animation_times(np.array([4 * FRAMES / FPS]))
+    assert played == pytest.approx(body.last_pose_s)
+    file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 4.0))
+    _, values = track(file, named(file, "one subject"), "weights")
+    assert values[-1].argmax() + 1 == 4 * (FRAMES - 1)
+
+
+def test_the_last_frame_stays_when_every_frame_has_a_mesh_of_its_own() -> None:
+    file = pygltflib.GLTF2.load_from_bytes(compose_glb([actor("many", per_frame(), loop=False)], 2.0))
+    last = [track(file, named(file, f"many frame_{i:03d}"), "scale")[1][-1, 0] for i in range(3)]
+    assert last == [0, 0, 1]
 
 
 def test_every_track_ends_with_the_scene() -> None:
@@ -154,9 +173,10 @@ def test_an_asset_still_moves_at_a_speed_at_which_its_keys_are_too_close(speed: 
     file = pygltflib.GLTF2.load_from_bytes(compose_glb([one], 1.0))
     keys, values = track(file, named(file, "one subject"), "weights")
     assert (np.diff(keys) > 0.99e-4).all() and len(keys) > 40 / fps / speed / 1.3e-4
-    assert keys[0] == np.float32(0.2) and not values[[0, -1]].any()  # frame 0 before and after
+    assert keys[0] == np.float32(0.2) and not values[0].any()  # frame 0 before
     shown = values[1:-2].argmax(1) + 1
     np.testing.assert_allclose(keys[1:-2], 0.2 + shown / fps / speed, atol=1e-7)
+    assert values[-1].argmax() + 1 == 39  # the last frame afterwards
 
 
 def test_a_looping_motion_is_cut_where_it_is_when_the_scene_ends() -> None:

@@ -1,9 +1,11 @@
 import math
+from typing import Any
 
 import pytest
 import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
+from dg4d_lib.errors import BadInput
 
 
 def seen(camera: OrbitCamera, point: tuple[float, float, float]) -> torch.Tensor:
@@ -33,6 +35,25 @@ def test_positive_elevation_is_above():
     assert OrbitCamera(30, 40).position()[1] > 0
     golden = torch.tensor([1.1133, -1.0, 1.3268], dtype=torch.float64)  # of the public code, 30 below
     torch.testing.assert_close(OrbitCamera(-30, 40).position(), golden, atol=5e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"width": 0}, "at least 1 x 1 pixels; given 0 x 256"),
+        ({"height": -3}, "at least 1 x 1 pixels; given 256 x -3"),
+        ({"fov_y_deg": 0.0}, "between 0 and 180 degrees; given 2.0 and 0.0"),
+        ({"fov_y_deg": 180.0}, "between 0 and 180 degrees"),
+        ({"fov_y_deg": math.nan}, "between 0 and 180 degrees"),
+        ({"radius": -2.0}, "radius above 0"),
+        ({"radius": math.inf}, "finite radius"),
+        ({"azimuth_deg": math.nan}, "angles of a camera must be finite"),
+        ({"elevation_deg": math.inf}, "angles of a camera must be finite"),
+    ],
+)
+def test_cameras_that_no_rasterizer_can_draw_are_refused(change: dict[str, Any], says: str):
+    with pytest.raises(BadInput, match=says):
+        OrbitCamera(**change)
 
 
 def test_rotations_are_proper():

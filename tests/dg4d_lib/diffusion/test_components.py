@@ -168,7 +168,7 @@ def test_a_linear_layer_is_read_from_either_format(suffix: str, tmp_path: Path) 
     read = components.read_linear(tmp_path, "proj", FP32)
     given = torch.rand(2, 5)
     assert torch.equal(read(given), layer(given)) and not read.weight.requires_grad
-    with pytest.raises(BadInput, match=r"no linear layer other\.weight"):
+    with pytest.raises(BadInput, match=r"not a linear layer other\.weight"):
         components.read_linear(tmp_path, "other", FP32)
 
 
@@ -177,7 +177,7 @@ def test_a_pickle_of_more_than_named_tensors_is_refused(
     content: dict[object, object], named: str, tmp_path: Path
 ) -> None:
     torch.save({"weight": torch.ones(2), **content}, tmp_path / "lora.bin")
-    with pytest.raises(BadInput, match=rf"lora\.bin is no file of named tensors: {named} is none"):
+    with pytest.raises(BadInput, match=rf"lora\.bin is not a file of named tensors: {named} is not a tensor"):
         components.read_tensors(tmp_path / "lora.bin")
 
 
@@ -218,7 +218,7 @@ def test_a_model_with_another_schedule_is_refused(copy: Path) -> None:
     tiny_weights.write_scheduler(copy / "scheduler", trained_betas=None, rescale_betas_zero_snr=False)
     noise_schedule.require_schedule(copy, expected)
     (copy / "scheduler" / "scheduler_config.json").write_text(json.dumps({"beta_start": 0.1}))
-    with pytest.raises(BadInput, match="no scheduler"):
+    with pytest.raises(BadInput, match="not a scheduler"):
         noise_schedule.read_schedule(copy)
     (copy / "scheduler" / "scheduler_config.json").unlink()
     with pytest.raises(BadInput, match="missing"):

@@ -87,8 +87,8 @@ def test_metadata_that_cannot_be_read_is_refused(stored: str, tmp_path: Path) ->
     [
         ({"block.other.lora_A.weight": DOWN, "block.other.lora_B.weight": UP}, "no linear layer block.other"),
         ({"block.to_q.lora_A.weight": DOWN[:, :2], "block.to_q.lora_B.weight": UP}, "block.to_q has 2 x 3 weights"),
-        ({"block.to_q.lora_A.weight": DOWN}, "is no LoRA of linear layers"),
-        ({"block.to_q.weight": DOWN}, "is no LoRA of linear layers"),
+        ({"block.to_q.lora_A.weight": DOWN}, "is not a LoRA of linear layers"),
+        ({"block.to_q.weight": DOWN}, "is not a LoRA of linear layers"),
     ],
 )
 def test_a_file_for_another_network_is_refused(tensors: dict[str, torch.Tensor], message: str, tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_what_is_no_pipeline_of_pictures_is_refused(model: Path, tmp_path: Path)
     other = shutil.copytree(model, tmp_path / "other")
     index = other / "model_index.json"
     index.write_text(index.read_text().replace('"StableDiffusionPipeline"', '"StableDiffusionImg2ImgPipeline"'))
-    with pytest.raises(BadInput, match=r"StableDiffusionImg2ImgPipeline .* is no text-to-image pipeline"):
+    with pytest.raises(BadInput, match=r"StableDiffusionImg2ImgPipeline .* is not a text-to-image pipeline"):
         draw(other)
 
 

@@ -51,5 +51,5 @@ def test_views_are_drawn_and_the_prompt_the_lora_and_the_seed_count(model: Path,
 
 
 def test_a_pipeline_of_words_alone_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* is no image-editing pipeline"):
+    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* is not an image-editing pipeline"):
         ViewDrawer.load(save_pipeline(tmp_path / "words"), None, SMALL, CPU)

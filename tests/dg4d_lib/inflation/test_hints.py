@@ -29,6 +29,7 @@ BULGE = torch.from_numpy(heights(MASK.numpy(), PIXEL)).float()
 TILT = 0.3 * (COLUMNS - 31.5) * PIXEL
 FRONT = TILT + BULGE  # of the disc's body, tilted about the vertical
 KNOWN = torch.ones(SIZE, SIZE, dtype=torch.bool)
+COVERED = KNOWN.float()
 
 
 def disc() -> torch.Tensor:
@@ -49,22 +50,22 @@ def test_the_plane_of_a_turn_rises_to_the_right() -> None:
 
 @pytest.mark.parametrize("unit", [1.0, 250.0])
 def test_distances_in_any_unit_give_the_middle_of_the_body(unit: float) -> None:
-    field = depth_field(unit * (2 - FRONT), KNOWN, ALPHA, "distance")
+    field = depth_field(unit * (2 - FRONT), COVERED, ALPHA, "distance")
     assert error(field) < 0.03
     assert abs(float(field.middle[MASK].mean())) < 0.05  # around z = 0
 
 
 def test_distances_of_an_enlarged_crop_are_as_deep_as_the_subject_is_wide() -> None:
     far = 8 - FRONT  # four times as far away, and cut out four times enlarged
-    near = depth_field(2 - FRONT, KNOWN, ALPHA, "distance")
-    cropped = depth_field(far, KNOWN, ALPHA, "distance", enlargement=4.0)
+    near = depth_field(2 - FRONT, COVERED, ALPHA, "distance")
+    cropped = depth_field(far, COVERED, ALPHA, "distance", enlargement=4.0)
     spans = [float(np.ptp(field.middle[field.known].numpy())) for field in (near, cropped)]
     assert spans[1] == pytest.approx(spans[0], rel=0.25)
 
 
 def test_inverse_depth_is_known_up_to_scale_and_offset() -> None:
     one, other = (
-        depth_field(scale / (2 - FRONT) + offset, KNOWN, ALPHA, "inverse")
+        depth_field(scale / (2 - FRONT) + offset, COVERED, ALPHA, "inverse")
         for scale, offset in ((1.0, 0.0), (90.0, 7.0))
     )
     assert (one.middle - other.middle).abs().max() < 1e-3
@@ -73,7 +74,7 @@ def test_inverse_depth_is_known_up_to_scale_and_offset() -> None:
 
 
 def test_a_range_of_inverse_depths_is_half_the_smaller_extent() -> None:
-    field = depth_field(1 / (2 - TILT), KNOWN, ALPHA, "inverse")
+    field = depth_field(1 / (2 - TILT), COVERED, ALPHA, "inverse")
     front = (field.middle + BULGE)[field.known].numpy()
     assert np.quantile(front, 0.98) - np.quantile(front, 0.02) == pytest.approx(0.5 * 40 * PIXEL, rel=0.1)
 
@@ -98,7 +99,7 @@ def test_a_depth_picture_goes_before_a_turn_and_layers_are_added_to_it() -> None
 
 
 def test_a_field_serves_pictures_of_every_size() -> None:
-    hint = DepthHint(0.0, depth_field(2 - FRONT, KNOWN, ALPHA, "distance"))
+    hint = DepthHint(0.0, depth_field(2 - FRONT, COVERED, ALPHA, "distance"))
     small, _ = hint.middle(32)
     assert small.shape == (32, 32)
     assert small[16, 24] == pytest.approx(float(hint.middle(SIZE)[0][32:34, 48:50].mean()), abs=0.01)
@@ -127,7 +128,7 @@ def test_one_part_painted_on_transparency_is_enough() -> None:
 def test_depth_pictures_that_say_nothing_are_refused(values: torch.Tensor, known: torch.Tensor, reason: str) -> None:
     for kind in ("inverse", "distance"):
         with pytest.raises(BadInput, match=reason):
-            depth_field(values, known, ALPHA, kind)
+            depth_field(values, known.float(), ALPHA, kind)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])
@@ -139,7 +140,7 @@ def test_layers_of_one_level_are_refused(level: float) -> None:
 
 
 def test_the_front_of_the_inflated_surface_lies_where_a_depth_picture_shows_it() -> None:
-    field = depth_field(2 - FRONT, KNOWN, ALPHA, "distance")
+    field = depth_field(2 - FRONT, COVERED, ALPHA, "distance")
     surface = inflate(disc(), SIZE, DepthHint(0.0, field))
     front = surface.vertices[surface.seen]
     across = front[:, 0] / (2 - front[:, 2]) * 2  # in the plane z = 0

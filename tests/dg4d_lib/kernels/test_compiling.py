@@ -1,40 +1,60 @@
 """Numba cache keys of our kernels, and the notice before a compilation."""
 
 import logging
+from pathlib import Path
 
 import pytest
 from numba import njit
 
-from dg4d_lib.kernels import compiling, simd
+from dg4d_lib.kernels import compiling
+from dg4d_lib.mesh import folds
 
 LOCATORS = [compiling._SourceFolderCache, compiling._UserCache]
 
 
 @pytest.fixture
-def stamp(tmp_path):
-    """Return a function that stamps a kernel with this source beside a file of constants."""
+def stamp(tmp_path, monkeypatch):
+    """Return a function that stamps a kernel with this source in a package with these other modules."""
+    monkeypatch.setattr(compiling, "_ROOT", tmp_path)
+    (tmp_path / "ours").mkdir()
 
-    def make(locator, source: str, constants: str):
+    def make(locator, source: str, **modules: str):
         compiling._digest.cache_clear()
-        (tmp_path / "constants.py").write_text(constants)
-        (tmp_path / "kernel.py").write_text(source)
-        return locator(lambda: None, str(tmp_path / "kernel.py")).get_source_stamp()
+        for name, text in modules.items():
+            (tmp_path / "ours" / f"{name}.py").write_text(text)
+        (tmp_path / "ours" / "kernel.py").write_text(source)
+        return locator(lambda: None, str(tmp_path / "ours" / "kernel.py")).get_source_stamp()
 
     yield make
     compiling._digest.cache_clear()
 
 
 @pytest.mark.parametrize("locator", LOCATORS)
-def test_a_change_beside_a_kernel_makes_its_machine_code_stale(locator, stamp):
-    source = f"from {simd.__name__} import KERNEL"
-    assert stamp(locator, source, "BLUR = 0.3") == stamp(locator, source, "BLUR = 0.3")
-    assert stamp(locator, source, "BLUR = 0.3") != stamp(locator, source, "BLUR = 0.4")
+@pytest.mark.parametrize(
+    "source", ["from ours.size import BLUR", "from ours.size import (\n    BLUR,\n)", "from ours import size"]
+)
+def test_a_change_of_what_a_kernel_imports_makes_its_machine_code_stale(locator, source, stamp):
+    assert stamp(locator, source, size="BLUR = 0.3") == stamp(locator, source, size="BLUR = 0.3")
+    assert stamp(locator, source, size="BLUR = 0.3") != stamp(locator, source, size="BLUR = 0.4")
+
+
+@pytest.mark.parametrize("locator", LOCATORS)
+def test_what_an_imported_kernel_imports_counts(locator, stamp):
+    source, between = "from ours.turn import turn", "from ours.size import BLUR\n\n@njit\ndef turn(): ..."
+    assert stamp(locator, source, turn=between, size="x = 1") != stamp(locator, source, turn=between, size="x = 2")
+    plain = "from ours.size import BLUR"
+    assert stamp(locator, source, turn=plain, size="x = 1") == stamp(locator, source, turn=plain, size="x = 2")
 
 
 @pytest.mark.parametrize("locator", LOCATORS)
 def test_a_kernel_that_stands_alone_depends_on_its_own_file_only(locator, stamp):
-    assert stamp(locator, "x = 1", "BLUR = 0.3") == stamp(locator, "x = 1", "BLUR = 0.4")
-    assert stamp(locator, "x = 1", "") != stamp(locator, "x = 2", "")
+    assert stamp(locator, "x = 1", size="BLUR = 0.3") == stamp(locator, "x = 1", size="BLUR = 0.4")
+    assert stamp(locator, "x = 1") != stamp(locator, "x = 22")
+
+
+def test_the_stamp_of_folds_covers_the_rotations_that_they_inline():
+    rotation = Path(compiling.__file__).parents[1] / "geometry" / "rotation.py"
+    assert rotation in set(compiling._imported(Path(folds.__file__)))
 
 
 def test_kernels_use_our_cache_locators():

@@ -64,6 +64,13 @@ def test_what_is_left_is_part_of_what_was(ball: TexturedMesh) -> None:
     assert torch.equal(small.texture, ball.texture)
 
 
+def test_what_is_left_keeps_its_smoothing_groups(ball: TexturedMesh) -> None:
+    grouped = replace(ball, smoothing_groups=torch.arange(len(ball.vertices)))
+    small, _ = simplify_mesh(grouped, bent(ball), 400)
+    assert small.smoothing_groups is not None
+    assert torch.equal(ball.vertices[small.smoothing_groups], small.vertices)
+
+
 def test_the_surface_stays_closed_along_the_seams(ball: TexturedMesh) -> None:
     small, _ = simplify_mesh(ball, bent(ball), 600)
     vertices, faces = weld_vertices(small.vertices.numpy(), small.faces.numpy())

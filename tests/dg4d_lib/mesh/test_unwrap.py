@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.mesh.extraction.clean import drop_small_components
-from dg4d_lib.mesh.texturing.chart_packing import THOROUGH
+from dg4d_lib.mesh.texturing.chart_packing import THOROUGH, _Chart
 from dg4d_lib.mesh.texturing.charts import find_charts
 from dg4d_lib.mesh.texturing.smoothing import taubin_smooth
 from dg4d_lib.mesh.texturing.unwrap import SMOOTHING, unwrap
@@ -94,6 +94,15 @@ def test_more_effort_covers_more_of_the_texture_and_overlaps_nothing(torus: Mesh
     areas = [-np.linalg.det(found[faces[:, 1:]] - found[faces[:, :1]]).sum() / 2 for found in (flat[2], uvs)]
     assert areas[1] >= areas[0] + 0.01
     assert (drawn(faces, uvs)[0] <= 1).all()
+
+
+def test_a_chart_keeps_the_cells_of_one_scale_only() -> None:
+    chart = _Chart(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0]]), np.array([[0, 1, 2]]), 8, 1)
+    small = list(chart.shapes(10.0, 2))
+    assert len(small) == 4 and small[0] is next(chart.shapes(10.0, 1))
+    large = list(chart.shapes(20.0, 1))
+    assert set(chart.known.values()) == set(large) and len(large) == 8
+    assert next(chart.shapes(10.0, 1)).height == small[0].height < large[0].height
 
 
 def test_a_texture_without_room_is_refused(torus: Mesh) -> None:

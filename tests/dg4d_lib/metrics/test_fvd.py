@@ -83,5 +83,5 @@ def test_a_file_that_is_no_torchscript_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="has no TorchScript file"):
         load_i3d(tmp_path, CPU)
     (tmp_path / "i3d.pt").write_bytes(b"something else")
-    with pytest.raises(BadInput, match=r"i3d\.pt is no TorchScript"):
+    with pytest.raises(BadInput, match=r"i3d\.pt is not a TorchScript"):
         load_i3d(tmp_path, CPU)

@@ -94,7 +94,7 @@ def test_a_file_that_does_not_fit_is_refused_by_name(tmp_path: Path):
     save_file(tiny().state_dict(), file)
     state = load_file(file)
     save_file({name: value for name, value in state.items() if "up_blocks" not in name}, file)
-    with pytest.raises(BadInput, match=r"no weights of LGM: found levels down \(32, 32, 64\), up \(\)"):
+    with pytest.raises(BadInput, match=r"not weights of LGM: found levels down \(32, 32, 64\), up \(\)"):
         load_lgm(file, CPU)
     del state["unet.mid_block.attns.0.attn.proj.bias"]
     save_file(state, file)

@@ -100,7 +100,7 @@ def test_a_loop_without_a_first_last_frame_model_is_refused(name: str, reason: s
 
 
 def test_a_pipeline_without_a_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* is no image-to-video pipeline"):
+    with pytest.raises(BadInput, match=r"StableDiffusionPipeline .* is not an image-to-video pipeline"):
         ImageToVideo.load(save_pipeline(tmp_path / "words"), small(), CPU)
 
 

@@ -53,12 +53,12 @@ def test_a_configuration_that_cannot_be_used_is_refused(tmp_path: Path, text: st
 
 @pytest.mark.parametrize("content", [b"", b"no model", tiny_model()[:-40]])
 def test_a_file_that_is_no_model_is_refused(content: bytes) -> None:
-    with pytest.raises(BadInput, match="no ONNX model"):
+    with pytest.raises(BadInput, match="not an ONNX model"):
         load_network(content, "net")
 
 
 def test_a_model_of_other_inputs_is_refused() -> None:
-    with pytest.raises(BadInput, match="no segmentation network"):
+    with pytest.raises(BadInput, match="not a segmentation network"):
         load_network(tiny_model(weights=(1.0,) * 4, channels=4), "net")
 
 

@@ -78,7 +78,7 @@ def test_several_candidates_are_those_of_their_seeds(model: VideoModel, subject:
 def test_another_number_of_frames_than_trained_is_said(model: VideoModel) -> None:
     assert not StableVideo(SETTINGS, model).notes
     longer = StableVideo(SETTINGS.model_copy(update={"frames": 6}), model)
-    assert "trained on 4 frames and made 6" in longer.notes[0]
+    assert "trained on 4 frames and generated 6" in longer.notes[0]
 
 
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (64, 128), (128, 64)])

@@ -60,5 +60,5 @@ def test_parallel_cameras_are_refused():
 def test_matrices_that_are_no_rotation_are_refused(column):
     flat = pose(90, 0, 2)
     flat[:, column] = flat[:, 2]
-    with pytest.raises(BadInput, match=r"frame 1 .* is no rotation"):
+    with pytest.raises(BadInput, match=r"frame 1 .* is not a rotation"):
         meeting_point(torch.stack([pose(0, 0, 2), flat]))

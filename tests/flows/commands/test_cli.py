@@ -413,7 +413,7 @@ def test_a_scene_of_another_suffix_is_refused_before_anything_is_loaded() -> Non
 def test_a_data_set_with_nothing_in_it() -> None:
     Path("empty/gt").mkdir(parents=True)
     refused(dg4d("bench", "empty", "-o", "out"), "holds no objects")
-    refused(dg4d("bench", "nowhere", "-o", "out"), "is no data set")
+    refused(dg4d("bench", "nowhere", "-o", "out"), "is not a data set")
     Path("one/thing/input").mkdir(parents=True)
     refused(dg4d("bench", "one", "-o", "out"), "has no input frames")
 

@@ -42,7 +42,7 @@ def test_a_profile_without_its_weights_is_refused_with_the_command(monkeypatch: 
     assert "paper: missing" in lines
     assert "  lacks weights svd" in lines
     assert any(line.endswith("dg4d weights pull paper") for line in lines)
-    assert lines[-1] == "  Without a GPU its networks run on the processor, for days."
+    assert lines[-1] == "  Without a GPU its networks run on the CPU, which takes days."
     assert "for days" not in dg4d().stdout
 
 

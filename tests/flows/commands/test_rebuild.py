@@ -181,7 +181,7 @@ def test_another_file_is_different_and_other_code_is_told(
     rebuilt = again(tmp_path / "out")
     assert outcomes(rebuilt)["contact_sheet.png"] == "different"
     assert rebuilt.exit_code == 1
-    assert "image: none then, dg4d/cpu:2 now" in rebuilt.environment_changes
+    assert "image: none recorded, dg4d/cpu:2 now" in rebuilt.environment_changes
     assert any(text.startswith("code: ") and text.endswith("+newer now") for text in rebuilt.environment_changes)
 
 

@@ -18,7 +18,7 @@ from waiting import wait_until
 from dg4d_lib.errors import BadInput
 from flows import convert
 from flows.commands import services
-from flows.serving import background, watching, workers
+from flows.serving import background, registering, watching, workers
 from flows.serving.server import Server, ServerUnavailable
 from flows.serving.workers import running
 from flows.ui import showing
@@ -53,7 +53,7 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     ]  # fmt: skip
     assert address == os.environ["PREFECT_API_URL"].removesuffix("/api")
     explained = said.stderr.splitlines()
-    assert explained[0].startswith("deployments, forms") and explained[-1].startswith(
+    assert explained[0].startswith("deployments with forms") and explained[-1].startswith(
         "open this address, the Prefect UI"
     )
     try:
@@ -74,6 +74,33 @@ def test_a_worker_for_the_server_of_somebody_else_stays_until_it_is_told_to_stop
     assert "stopped!" in log.read_text()  # it was not killed
     assert server.auth_string().partition(":")[2] not in stopped.stderr + log.read_text()
     assert dg4d("down").stdout == "nothing was running\n"
+
+
+@pytest.mark.parametrize(
+    ("pool", "registered", "choose"),
+    [
+        (
+            "kubernetes-cpu",
+            ["picture-to-4d/Picture to 4D on Kubernetes"],
+            "Deployments, Picture to 4D on Kubernetes, Run",
+        ),
+        ("fleet", ["item-to-4d/Item to 4D on a fleet"], ""),
+    ],
+)
+def test_up_names_a_deployment_that_it_registered_and_how_to_sign_in(
+    pool: str, registered: list[str], choose: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    monkeypatch.setenv("PREFECT_API_URL", "http://server:4200/api")
+    monkeypatch.setattr(convert, "connect", lambda: None)
+    monkeypatch.setattr(registering, "register", lambda *_: registered)
+    services.up([pool], workers=False)
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == "http://server:4200"
+    advice = said.err.splitlines()[-1]
+    assert "signs the browser in at /dg4d/login#NAME:PASSWORD" in advice
+    assert advice.partition("; then choose ")[2] == choose
 
 
 GUARD = """
@@ -249,8 +276,8 @@ def test_a_watch_says_what_it_reads_and_what_goes_on_after_it(
         services.watch(inbox, inbox.parent / "out", 0.0)
     said = capsys.readouterr()
     assert "for pictures, videos and manifests (other files are ignored, models need a manifest)" in said.out
-    assert "files came to rest; sent to the server; packages are named here when they are done\n" in said.out
-    assert "stopped watching; conversions that were sent go on until `dg4d down`\n" in said.err
+    assert "s: files sent to the server; finished packages are listed below\n" in said.out
+    assert "stopped watching; conversions that were sent continue until `dg4d down`\n" in said.err
 
 
 def test_a_slow_server_does_not_count_as_rest(inbox: Path, monkeypatch: pytest.MonkeyPatch) -> None:

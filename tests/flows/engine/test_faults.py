@@ -236,7 +236,7 @@ def test_a_step_whose_memory_is_limited_is_tried_again_and_then_says_so(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DG4D_EXECUTOR", "subprocess")
-    with pytest.raises(StepOutOfMemory, match="memory ran out: end other programs, or choose smaller settings"):
+    with pytest.raises(StepOutOfMemory, match=r"memory ran out: end other programs, or lower subject\.size"):
         convert_job(job("prepare_subject=hoard", tmp_path), tmp_path / "out")
     assert ran(log) == EVERY_STEP[:1] * (1 + RETRIES)
 

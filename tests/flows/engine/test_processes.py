@@ -1,17 +1,23 @@
 """Processes are told apart, also those of containers that have the name of their host; lost signals come again."""
 
+import errno
+import fcntl
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
+from typing import IO
 
 import pytest
 
 from flows import processes
-from flows.processes import OWN_START, host_id, repeated, start_of
+from flows.engine import resources
+from flows.processes import OWN_START, host_id, locked, repeated, start_of
+from flows.serving import server
 
 HOSTNAME_TOO = "import socket; from flows.processes import host_id; print(socket.gethostname(), host_id())"
 
@@ -89,3 +95,47 @@ def test_a_signal_without_a_handler_keeps_its_default() -> None:
     with repeated(signal.SIGUSR1):
         assert signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL
     signal.signal(signal.SIGUSR1, before)
+
+
+@pytest.fixture
+def nfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder where a shared lock takes a descriptor that can read, an exclusive one a descriptor that can write."""
+    flock = fcntl.flock
+    wrong = {fcntl.LOCK_SH: os.O_WRONLY, fcntl.LOCK_EX: os.O_RDONLY}
+
+    def checked(file: int | IO[str], operation: int) -> None:
+        mode = fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE
+        if wrong.get(operation & ~fcntl.LOCK_NB) == mode:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", checked)
+    return tmp_path
+
+
+def test_a_lock_is_taken_on_nfs(nfs: Path) -> None:
+    (nfs / "kept").write_text("kept")
+    for name in ("new", "kept"):
+        with locked(nfs / name, shared=True) as first, locked(nfs / name, shared=True) as second:
+            assert first and second
+            with locked(nfs / name) as alone:
+                assert not alone
+        with locked(nfs / name) as alone, locked(nfs / name, shared=True) as first:
+            assert alone and not first
+    assert (nfs / "kept").read_text() == "kept"
+
+
+def test_a_queue_and_a_slot_work_on_nfs(nfs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_SLOTS", str(nfs / "slots"))
+    (nfs / "slots" / "queue-cpu").mkdir(parents=True)
+    (nfs / "slots" / "queue-cpu" / "0-0.ticket").write_text("left by a process that was killed")
+    with resources.slot("cpu", lambda _: None) as waited_s:
+        assert waited_s < 5
+
+
+def test_a_server_is_in_use_on_nfs(nfs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "spawn_guard", lambda *_: None)
+    started = server.Server(nfs / "server", nfs / "prefect")
+    started.start()
+    assert started.is_used()
+    started.release()

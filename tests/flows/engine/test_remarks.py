@@ -69,7 +69,7 @@ def test_the_first_look_at_the_splats_is_a_page_for_its_owner() -> None:
     done = result(b"picture", NOTE, step="fit_gaussians")
     ref = home.store().put_bytes(b"D4WS of a fox", "application/vnd.dg4d.splats+websplats")
     (text,) = told("a fox/red", done.model_copy(update={"outputs": {**done.outputs, "first_look": ref}}))
-    page = Path(text.removeprefix("First look, the splats from all sides: "))
+    page = Path(text.removeprefix("Preview of the static splats: "))
     assert page.parent == home.first_looks() and page.name.startswith("a-fox-red-") and page.suffix == ".html"
     assert stat.S_IMODE(page.stat().st_mode) == 0o600
     assert page.read_text() == viewer_of_splats(b"D4WS of a fox", "a fox/red")
@@ -93,7 +93,7 @@ def test_failed_gates_of_a_cutout_are_told_with_their_advice() -> None:
     done = result(b"picture", NOTE)
     ref = home.store().put_bytes(json.dumps({"gates": rows}).encode(), "application/vnd.dg4d.gates+json")
     (text,) = told("fox", done.model_copy(update={"outputs": {**done.outputs, "cutout_gates": ref}}))
-    assert f"{NOTE} Not accepted: cut-out pieces is 0.4, allowed is at most 0.1; give a mask. Source" in text
+    assert f"{NOTE} Not accepted: cut-out pieces = 0.4, allowed: at most 0.1; give a mask. Source" in text
     assert "holes" not in text
 
 

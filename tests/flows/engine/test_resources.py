@@ -259,3 +259,20 @@ def test_a_full_disk_keeps_no_slot_and_no_ticket(tmp_path: Path, monkeypatch: py
     assert list((tmp_path / "home" / "slots" / "queue-cpu").iterdir()) == []
     with slot("cpu", silent) as waited_s:
         assert waited_s < 5
+
+
+def test_slots_and_queues_are_in_the_folder_that_the_variable_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with slot("gpu", silent):  # of another pod, whose home folder is the same
+        monkeypatch.setenv("DG4D_SLOTS", str(tmp_path / "pod" / "slots"))
+        with slot("gpu", silent) as waited_s:
+            assert waited_s < 5
+            names = {path.name for path in (tmp_path / "pod" / "slots").iterdir()}
+    assert names == {"gpu-0.lock", "queue-gpu"}
+
+
+def test_a_relative_folder_of_slots_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_SLOTS", "slots")
+    with pytest.raises(BadInput, match="'slots'; set it to an absolute path"), slot("cpu", silent):
+        pass

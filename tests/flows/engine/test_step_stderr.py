@@ -55,7 +55,7 @@ def message_of(name: str) -> str:
 @pytest.mark.parametrize(
     ("name", "lines"),
     [
-        ("exits", ["ended with status 7", "the license server refused"]),
+        ("exits", ["exited with status 7", "the license server refused"]),
         ("segfaults", ["killed by signal 11", "Segmentation fault", "in segfaults"]),
         ("aborts", ["killed by signal 6", "the driver is too old"]),
         ("broken", ["libfoo.so.3 is missing"]),
@@ -70,5 +70,5 @@ def test_the_message_of_a_program_that_cannot_be_imported_shows_why(place: Path)
     (place / "first").mkdir()
     (place / "first" / "pydantic.py").write_text('raise ImportError("libpydantic.so: cannot open shared object file")')
     message = message_of("exits")
-    assert "ended with status 1" in message
+    assert "exited with status 1" in message
     assert "libpydantic.so: cannot open shared object file" in message

@@ -127,6 +127,6 @@ def test_a_secret_in_a_ground_truth_is_not_stored(tmp_path: Path, store: Artifac
         (tmp_path / "newt" / folder / "0.png").write_text(picture(folder))
     put_truth(find_ground_truth(tmp_path / "newt"), store)
     (tmp_path / "newt" / name).write_bytes(SECRET)
-    with pytest.raises(BadInput, match=r"0\.png: the file is a text file|mesh\.npz is no NumPy archive"):
+    with pytest.raises(BadInput, match=r"0\.png: the file is a text file|mesh\.npz is not a NumPy archive"):
         put_truth(find_ground_truth(tmp_path / "newt"), store)
     assert len(kept(store)) == 1

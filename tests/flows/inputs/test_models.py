@@ -105,8 +105,8 @@ REFUSED = {
     "a.fbx": (b"x", "export the model as GLB"),
     "b.glb": (b"", "0 bytes"),
     "c.glb": (b"PK??", r"does not start as a \.glb"),
-    "d.gltf": (b"{", "no glTF"),
-    "e.gltf": (b"[" * 2000, "no glTF"),
+    "d.gltf": (b"{", "not a glTF file"),
+    "e.gltf": (b"[" * 2000, "not a glTF file"),
     "f.spz": (b"nothing", r"does not start as a \.spz"),
 }
 

@@ -123,6 +123,26 @@ def test_a_bad_line_of_csv_fails_its_row_alone(tmp_path: Path, line: bytes, says
     assert says in error and error.startswith("row 2: ")
 
 
+@pytest.mark.parametrize("header", ["path;name", "path\tseed", "path;mesh.grid", "sep=;"])
+def test_a_csv_whose_columns_have_no_commas_between_them_is_refused_with_the_remedy(
+    tmp_path: Path, header: str
+) -> None:
+    (tmp_path / "m.csv").write_text(f"{header}\na.png;64\n")
+    with pytest.raises(BadInput, match="separate the columns with commas") as raised:
+        items(tmp_path / "m.csv")
+    assert repr(header) in str(raised.value)
+
+
+def test_spaces_around_the_names_of_columns_and_after_commas_do_not_count(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(' path, name ,text , mesh.grid\n, fox, "red, fat", 64\n')
+    (item,) = items(tmp_path / "m.csv")
+    assert (item.name, item.error) == ("fox", "")
+    assert item.request is not None and item.request.text == "red, fat"
+    (tmp_path / "m.csv").write_text("path, path\na.png,b.png\n")
+    with pytest.raises(BadInput, match="two columns 'path'"):
+        items(tmp_path / "m.csv")
+
+
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
 @pytest.mark.parametrize("kind", ["csv", "json"])
 def test_a_manifest_in_utf_16_is_refused_with_the_remedy(tmp_path: Path, kind: str, encoding: str) -> None:

@@ -72,7 +72,7 @@ def test_the_package_is_what_ro_crate_and_the_profile_require(crate: ROCrate) ->
     assert root["conformsTo"].id == "https://w3id.org/ro/wfrun/process/0.5"
     assert root["conformsTo"].type == "CreativeWork"
     assert root["name"] == "red fox"
-    assert "guessed" in root["description"]
+    assert "predicted" in root["description"]
     assert root["datePublished"] == "2026-11-22T10:00:04.750+00:00"
     assert {its.id for its in root["license"]} == {"#license", "#license-svd"}
     assert [action.id for action in root["mentions"]] == [f"#{i}-{step}" for i, step in enumerate(STEPS, 1)]
@@ -254,7 +254,7 @@ def test_no_field_beside_the_stated_digest_is_left_out_of_it(folder: Path) -> No
 def test_a_package_without_weights_says_so_and_names_no_license_of_a_model(tmp_path: Path) -> None:
     folder = made_package(tmp_path)
     (license_,) = [entity for entity in document(folder)["@graph"] if entity["@id"].startswith("#license")]
-    assert "No weights were used" in license_["description"]
+    assert "No downloaded weights were used" in license_["description"]
 
 
 def test_signed_files_say_what_they_were_before_and_where_their_credentials_are(tmp_path: Path) -> None:

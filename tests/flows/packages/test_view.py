@@ -54,7 +54,7 @@ def package(tmp_path: Path) -> Path:
 def test_splats_of_the_store_have_a_page_without_a_mesh(tmp_path: Path, package: Path) -> None:
     (tmp_path / "splats").write_bytes(b"D4WS and more")
     page = viewer_of_artifact(tmp_path / "splats", "a <fox>")
-    assert "<h1>a &lt;fox&gt;: first look</h1>" in page
+    assert "<h1>a &lt;fox&gt;: static splats</h1>" in page
     assert 'id="data-splats"' in page and 'id="data-glb"' not in page
     packed = tmp_path / "package.zip"
     assert viewer_of_artifact(packed, "a fox") == viewer_of_package(packed, "a fox")

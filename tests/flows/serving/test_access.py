@@ -176,6 +176,15 @@ def test_an_artifact_needs_the_secret_or_a_session_of_our_own_page(server: Serve
     assert ask(server, "/api/admin/version", Cookie=cookie, **OWN_PAGE)[0] == 401  # it opens artifacts only
 
 
+def test_who_is_not_signed_in_is_told_the_form_of_the_address_that_signs_in(
+    server: Server, artifact: ArtifactRef
+) -> None:
+    status, _, said = ask(server, address_of(artifact))
+    assert status == 401
+    for text in (said, ask(server, "/dg4d/login")[2]):
+        assert b"/dg4d/login#NAME:PASSWORD" in text and b"$PREFECT_SERVER_API_AUTH_STRING" in text
+
+
 def test_a_browser_that_is_not_signed_in_is_sent_to_the_page_that_signs_in(
     server: Server, artifact: ArtifactRef
 ) -> None:

@@ -54,13 +54,13 @@ def test_the_form_offers_every_profile() -> None:
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
-        ("picture-to-4d", ["Picture", "Output folder", "How it is made", "Other sides", "Cut-out and depth"]),
-        ("video-to-4d", ["Video", "Output folder", "How it is made", "Other sides", "Cut-out and depth"]),
-        ("model-to-4d", ["Model", "Output folder", "Picture", "How it is made"]),
-        ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Items run on",
-                           "Stop at a faulty asset", "How it is made"]),
-        ("benchmark", ["Data set", "Output folder", "Objects at most", "Score the meshes",
-                       "Ground-truth views as the prior", "Items at a time", "How it is made"]),
+        ("picture-to-4d", ["Picture", "Output folder", "Options", "Other sides", "Cut-out and depth"]),
+        ("video-to-4d", ["Video", "Output folder", "Options", "Other sides", "Cut-out and depth"]),
+        ("model-to-4d", ["Model", "Output folder", "Picture", "Options"]),
+        ("catalog-to-4d", ["Pictures and videos", "Output folder", "Items at a time", "Where items run",
+                           "Stop at the first failed gate", "Options"]),
+        ("benchmark", ["Data set", "Output folder", "Maximum number of objects", "Score the meshes",
+                       "Ground-truth views as the prior", "Items at a time", "Options"]),
     ],
 )  # fmt: skip
 def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
@@ -76,11 +76,7 @@ def test_a_form_has_a_plain_field_for_everything_in_a_sensible_order(
         "Profile", *(["Motion"] if pictures else []), "Triangles", "Texture size", "Frames per second", "Seed",
         "Commercial use only", "Further settings",
     ]  # fmt: skip
-    plain = [
-        field
-        for field in in_order(form)
-        if field["title"] not in {"How it is made", "Other sides", "Cut-out and depth"}
-    ]
+    plain = [field for field in in_order(form) if field["title"] not in {"Options", "Other sides", "Cut-out and depth"}]
     for field in [*plain, *in_order(options)]:
         assert field["description"] and field["title"][0].isupper()
         assert field["type"] in {"string", "integer", "number", "boolean", "array"}  # a choice of types is a riddle
@@ -130,6 +126,15 @@ def test_automations_that_two_commands_made_twice_are_one_again(client: SyncPref
     assert len(client.read_automations_by_name(one.name)) == 2
     registering._automate(client)
     assert len(client.read_automations_by_name(one.name)) == 1
+
+
+def test_automations_of_an_earlier_version_are_removed(client: SyncPrefectClient) -> None:
+    for one, name in zip(registering.AUTOMATIONS, registering.RENAMED, strict=True):
+        client.create_automation(one.model_copy(update={"name": name}))
+    registering._automate(client)
+    there = [automation.name for automation in client.read_automations()]
+    assert not {*there} & {*registering.RENAMED}
+    assert all(there.count(automation.name) == 1 for automation in registering.AUTOMATIONS)
 
 
 def test_commands_register_one_after_the_other(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_a_file_that_was_removed_from_the_store_is_stored_again(draft: Draft) ->
 
 
 def test_a_mask_that_claims_to_be_huge_is_refused(draft: Draft) -> None:
-    with pytest.raises(BadInput, match="no PNG that can be read"):
+    with pytest.raises(BadInput, match="not a readable PNG"):
         draft.save_mask(huge_png(), (8, 8))
     assert pages.small_webp(BytesIO(huge_png()), 10_000) is None
 

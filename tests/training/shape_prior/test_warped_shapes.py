@@ -1,4 +1,4 @@
-"""Warps of made-up shapes: surfaces go where the map takes them, joints hold, symmetry stays."""
+"""Warps of synthetic shapes: surfaces go where the map takes them, joints hold, symmetry stays."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Families of made-up creatures and things, and how often each is drawn."""
+"""Families of synthetic creatures and things, and how often each is sampled."""
 
 from collections.abc import Callable
 

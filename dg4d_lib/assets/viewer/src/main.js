@@ -9,7 +9,7 @@ import { readSplats } from "./splats.js";
 import { Stage, canDraw } from "./stage.js";
 
 const NO_WEBGL =
-  "This browser cannot draw in 3D: it has no WebGL 2, or it is switched off. The films beside this page show the asset without it.";
+  "This browser cannot show 3D content: WebGL 2 is missing or disabled. Open preview.mp4 or turntable.mp4 instead.";
 
 const stageElement = document.getElementById("stage");
 
@@ -35,7 +35,7 @@ async function start() {
   let mode;
 
   const show = (what) => {
-    if (!modes.includes(what)) throw new Error(`${what} is not here; there are ${modes.join(", ")}`);
+    if (!modes.includes(what)) throw new Error(`unknown display mode ${what}; available: ${modes.join(", ")}`);
     mode = what;
     for (const one of shown) one.show(what);
     draw();

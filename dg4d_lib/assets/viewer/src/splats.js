@@ -6,7 +6,7 @@ const MAGIC = "D4WS";
 /** Decodes a file to `MovingSplats`. */
 export async function readSplats(bytes) {
   const { buffer, byteOffset } = bytes;
-  if (new TextDecoder().decode(bytes.subarray(0, 4)) !== MAGIC) throw new Error("these are no splats for the web");
+  if (new TextDecoder().decode(bytes.subarray(0, 4)) !== MAGIC) throw new Error("the splat data is not in the .websplats format");
   const start = 8 + new DataView(buffer, byteOffset).getUint32(4, true);
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(8, start)));
   return new MovingSplats(header, await inflate(bytes.subarray(start)));

@@ -1,4 +1,4 @@
-"""Made-up samples: determinism, symmetry, framing, and matter that agrees with the picture."""
+"""Synthetic samples: determinism, symmetry, framing, and matter that agrees with the picture."""
 
 import math
 
