@@ -179,7 +179,7 @@ def batch(
     """
     if workers < 1:
         raise BadInput(f"workers is {workers}; at least 1 is needed")
-    out, changes = Path(out), flat_settings(settings)
+    out, changes = _path("out", out) or Path("out"), flat_settings(settings)
     with _items(pictures, out, profile, changes, seed) as items:
 
         def convert(item: Item) -> Asset | Exception:
@@ -272,20 +272,31 @@ def _items(
     pictures: str | Path | Iterable[Picture], out: Path, profile: str, changes: dict[str, Any], seed: int
 ) -> Iterator[list[Item]]:
     """Yield the items of a batch; pictures in memory are files meanwhile."""
-    if isinstance(pictures, str | Path):
-        yield items_of(pictures, out, profile, changes, seed)
+    if isinstance(pictures, str | os.PathLike):
+        yield items_of(Path(pictures) if isinstance(pictures, os.PathLike) else pictures, out, profile, changes, seed)
         return
+    if not isinstance(pictures, Iterable):
+        raise BadInput(
+            f"pictures is a list of pictures, a folder, a pattern or a manifest; given {type(pictures).__name__}"
+        )
     base = revise(named_profile(profile), changes)
     with tempfile.TemporaryDirectory(prefix="dg4d-pictures-") as scratch:
-        paths = []
+        paths: list[Path] = []
+        errors: dict[Path, str] = {}  # of pictures in memory that cannot be used
         for number, one in enumerate(pictures, 1):
-            folder = Path(scratch) / str(number)
-            paths.append(_file(one, folder, f"picture-{number}"))
+            stem = f"picture-{number}"
+            try:
+                paths.append(_file(one, Path(scratch) / str(number), stem))
+            except BadInput as error:
+                paths.append(Path(scratch) / str(number) / f"{stem}.png")
+                errors[paths[-1]] = str(error)
         if not paths:
             raise BadInput("the batch is empty; give one picture or more")
         names = unique_names([(name_from_path(path), path.suffix.lstrip(".")) for path in paths])
         yield [
-            Item(name=name, request=_request(item=name, picture=path, profile=profile, settings=base, seed=seed))
+            Item(name=name, error=errors[path])
+            if path in errors
+            else Item(name=name, request=_request(item=name, picture=path, profile=profile, settings=base, seed=seed))
             for name, path in zip(names, paths, strict=True)
         ]
 
@@ -317,7 +328,10 @@ def _written(given: Any, folder: Path, stem: str, what: What) -> Path:
     from PIL import Image, ImageOps
 
     picture = given if isinstance(given, Image.Image) else Image.fromarray(_pixels(given, what))
-    picture = ImageOps.exif_transpose(picture)  # as in files
+    try:
+        picture = ImageOps.exif_transpose(picture)  # as in files; an opened file is read here
+    except (OSError, ValueError, SyntaxError) as error:  # a broken file, or one that was closed
+        raise BadInput(f"a PIL image cannot be read: {error}; open it again, or export it as PNG or JPEG") from error
     if picture.mode not in PNG_MODES:
         if picture.mode not in CONVERTED_MODES:
             raise BadInput(
@@ -338,7 +352,13 @@ def _pixels(given: Any, what: What) -> "NDArray[np.uint8]":
     """
     import numpy as np
 
-    pixels = np.asarray(given)
+    try:
+        pixels = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:  # tensors on a GPU or with gradients, rows of unequal length
+        raise BadInput(
+            f"a {what} is a path, a PIL image or an array; given {type(given).__name__}, which NumPy cannot convert: "
+            f"{error}"
+        ) from error
     is_plane = what == "mask" and pixels.ndim == 2
     is_picture = pixels.ndim == 3 and pixels.shape[2] in CHANNELS
     is_known = pixels.dtype == np.uint8 or pixels.dtype.kind in ("fb" if what == "mask" else "f")

@@ -19,7 +19,8 @@ class GltfSettings(Settings):
     )
     quality: int = Field(85, ge=1, le=100, description="JPEG or WebP quality; from 85, JPEG does not subsample chroma")
     quantized: bool = Field(
-        True, description="16 bits for positions and 8 for normals instead of 32 (KHR_mesh_quantization)"
+        True,
+        description="16 bits for positions (skinned files: 32) and 8 for normals instead of 32 (KHR_mesh_quantization)",
     )
     meshopt: bool = Field(
         False,

@@ -64,8 +64,8 @@ def nearest_rotation(m, rotation):
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _is_off(p, q, pq):
-    """Return true if a rotation of two axes by the element that couples them would change a digit."""
-    return abs(pq) >= 1e-300 and abs(q - p) < 2 * STEEP * abs(pq)
+    """Return true if a rotation of two axes by the element that couples them would change a digit, or for NaN."""
+    return not (abs(pq) < 1e-300 or abs(q - p) >= 2 * STEEP * abs(pq))
 
 
 @njit(cache=True, nogil=True, inline="always")

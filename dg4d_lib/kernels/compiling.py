@@ -83,6 +83,9 @@ class _UserCache(_SourceDigest, UserWideCacheLocator):
 @cache
 def _digest(kernel: Path) -> bytes:
     """Return a digest of the modules whose functions and constants a kernel may inline, empty if there are none."""
+    ours = __name__.split(".")[0]
+    if not any(module.split(".")[0] == ours for module, _ in _IMPORT.findall(kernel.read_text(encoding="utf-8"))):
+        return b""  # a kernel that stands alone, or of another package
     content, found, queue = hashlib.sha256(), set[Path](), [kernel]
     while queue:
         for path in _imported(queue.pop()):

@@ -37,7 +37,7 @@ def batch(request: CatalogRequest, console: "Console", allow: Callable[[Item], N
     out = request.out
     parse_where(request.where)
     items = request.items(allow)
-    resources.cpus(), resources.gpus()  # validate $DG4D_CPUS and $DG4D_GPUS before any work
+    resources.cpus(), resources.gpus(), resources.slot_folder()  # validate $DG4D_CPUS, $DG4D_GPUS and $DG4D_SLOTS first
     check_writable(out)
     out.mkdir(parents=True, exist_ok=True)
     writer = Writer(out, request.commercial_only, request.price_per_hour)

@@ -120,7 +120,7 @@ def _image(binary: str, name: str) -> _Image:
     answer = _ask([binary, "image", "inspect", name])
     if answer is None:
         raise BackendUnavailable(
-            f"{binary} has no image {name}: build it with `deploy/containers.sh build`, or pull it, or name another in "
+            f"{binary} has no image {name}: build it with `deploy/containers.sh build`, or name another in "
             "$DG4D_IMAGE_CPU or $DG4D_IMAGE_CUDA"
         )
     facts = json.loads(answer)[0]

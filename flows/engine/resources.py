@@ -20,7 +20,7 @@ from dg4d_lib.rasterizer.backends import CUDA, cuda_device_count
 from flows.engine.turns import first_ahead, ticket
 from steps.contract import StepRequest
 from steps.runtime.installed_code import catalog
-from steps.store.files import home
+from steps.store.files import NO_SPACE, home
 
 Resource = Literal["cpu", "gpu"]
 
@@ -83,7 +83,6 @@ def slot(resource: Resource, waiting: Callable[[str], None], turn: Turn | None =
         BadInput: `$DG4D_GPUS`, `$DG4D_CPUS` or `$DG4D_SLOTS` is invalid.
     """
     folder = slot_folder()
-    folder.mkdir(parents=True, exist_ok=True)
     devices = gpus() if resource == "gpu" else tuple(map(str, range(cpus())))
     turn = turn or Turn(time.time_ns(), "another step")
     start, reported = time.monotonic(), False
@@ -143,17 +142,24 @@ def cpus() -> int:
 
 
 def slot_folder() -> Path:
-    """Return the folder of the slots: `$DG4D_SLOTS`, else `$DG4D_HOME/slots`.
+    """Return the folder of the slots, created if missing: `$DG4D_SLOTS`, else `$DG4D_HOME/slots`.
 
     Raises:
-        BadInput: `$DG4D_SLOTS` is a relative path.
+        BadInput: `$DG4D_SLOTS` is a relative path, or not a folder that this user can write to.
     """
     given = os.environ.get(SLOTS_VARIABLE)
-    if not given:
-        return home() / "slots"
-    if not Path(given).is_absolute():  # commands in other folders would have slots of their own
+    folder = Path(given) if given else home() / "slots"
+    if not folder.is_absolute():  # commands in other folders would have slots of their own
         raise BadInput(f"${SLOTS_VARIABLE} is {given!r}; set it to an absolute path, or unset it")
-    return Path(given)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if not given or error.errno in NO_SPACE:
+            raise
+        raise _unusable_slots(given, str(error.strerror)) from error
+    if given and not os.access(folder, os.W_OK | os.X_OK):
+        raise _unusable_slots(given, "no permission to write to it")
+    return folder
 
 
 def slots() -> int:
@@ -163,6 +169,10 @@ def slots() -> int:
         BadInput: `$DG4D_GPUS` or `$DG4D_CPUS` is invalid.
     """
     return len(gpus()) + cpus()
+
+
+def _unusable_slots(given: str, reason: str) -> BadInput:
+    return BadInput(f"${SLOTS_VARIABLE} is {given!r}: {reason}; set it to a folder that you can write to, or unset it")
 
 
 _held: ContextVar[Slot | None] = ContextVar("held", default=None)

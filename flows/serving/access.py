@@ -20,6 +20,10 @@ PREFIX = "/dg4d/"  # of all routes beside Prefect's
 SESSION = "/dg4d/session"
 READING = frozenset(["GET", "HEAD", "OPTIONS"])
 OWN_SITES = frozenset(["same-origin", "none"])  # Sec-Fetch-Site of our own pages, and of a typed address
+UNAUTHORIZED = (
+    "Unauthorized: sign in at the address that `dg4d up` or `dg4d studio` prints, or, on a server of your own, at "
+    f"{LOGIN}#NAME:PASSWORD with the value of its $PREFECT_SERVER_API_AUTH_STRING."
+)
 HEADERS = {
     # Prefect's pages load nothing from elsewhere (they would report what is clicked), nor do pictures in artifacts;
     # without 'unsafe-eval' the drawing library of their run graph draws nothing
@@ -94,12 +98,6 @@ def is_foreign(headers: Headers, method: str) -> bool:
     if origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower():
         return True
     return method not in READING and headers.get("sec-fetch-site", "none") not in OWN_SITES
-
-
-UNAUTHORIZED = (
-    "Unauthorized: sign in at the address that `dg4d up` or `dg4d studio` prints, or, on a server of your own, at "
-    f"{LOGIN}#NAME:PASSWORD with the value of its $PREFECT_SERVER_API_AUTH_STRING."
-)
 
 
 class SignIn:

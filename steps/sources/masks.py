@@ -29,8 +29,8 @@ def read_mask(
         max_decode_gb: memory limit in GiB.
 
     Raises:
-        BadInput: the mask cannot be read, is colored or almost black, or its size or number of frames differs from the
-            source's.
+        BadInput: the mask cannot be read, is colored, almost black or almost transparent, or its size or number of
+            frames differs from the source's.
     """
     try:
         mask = read_source(path, scratch, max_frames, max_decode_gb)
@@ -48,9 +48,10 @@ def read_mask(
         raise BadInput(f"{given}, the video {source.count}; give a folder with one mask for every frame")
     values = mask.frames[..., 3] if mask.has_alpha else _brightness(mask.frames[..., :3])
     if 0 < (largest := float(values.max())) <= VISIBLE:
+        where, needed = ("transparent", "opaque") if mask.has_alpha else ("black", "white")
         raise BadInput(
-            f"--mask is almost black: its largest value is {255 * largest:.2g} of 255, and the subject must be white; "
-            "multiply a mask of labels 0 and 1 by 255"
+            f"--mask is almost {where}: its largest value is {255 * largest:.2g} of 255, and the subject must be "
+            f"{needed}; multiply a mask of labels 0 and 1 by 255 (16 bits: by 65535)"
         )
     return resize_planes(values[None], source.frames.shape[1:3])[0].clamp(0, 1)
 
@@ -61,9 +62,9 @@ def _brightness(colors: Float[Tensor, "t h w 3"]) -> Float[Tensor, "t h w"]:
     Raises:
         BadInput: they are colored.
     """
-    painted = colors[colors.amax(-1) > VISIBLE]
-    tint = float((painted.amax(-1) - painted.amin(-1)).mean()) if len(painted) else 0.0
-    if tint > MOST_TINT:
+    largest = colors.amax(-1)
+    painted = largest > VISIBLE
+    if painted.any() and float((largest - colors.amin(-1))[painted].mean()) > MOST_TINT:
         raise BadInput(
             "--mask is colored, so its brightness is not the opacity of the subject; paint the subject white and the "
             "background black, or give a picture whose alpha channel is the mask"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+import torch
 from conversions import EVERY_STEP, ran
 from fake_steps import picture
 from PIL import Image
@@ -227,6 +228,26 @@ def test_mask_and_views_in_memory_are_those_of_files(monkeypatch: pytest.MonkeyP
     assert [one["name"] for one in given] == ["view-1.png", "view-2.png", "left.png"]
 
 
+@pytest.mark.parametrize(
+    "given", [[[1], [1, 2]], torch.zeros(4, 4, 3, requires_grad=True), torch.zeros(4, 4, 3, dtype=torch.bfloat16)]
+)
+def test_what_numpy_cannot_convert_is_refused(given: Any) -> None:
+    with pytest.raises(BadInput, match=r"a picture is a path, a PIL image or an array; given .*cannot convert"):
+        dg4d.make(given)
+
+
+def test_a_pil_image_of_a_broken_or_closed_file_is_refused() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    Image.fromarray(noise).save("noise.png")
+    Path("broken.png").write_bytes(Path("noise.png").read_bytes()[:2000])
+    with Image.open("broken.png") as broken, pytest.raises(BadInput, match="a PIL image cannot be read"):
+        dg4d.make(broken)
+    closed = Image.fromarray(noise)
+    closed.close()
+    with pytest.raises(BadInput, match="a PIL image cannot be read"):
+        dg4d.make(closed)
+
+
 def test_a_picture_in_memory_is_turned_upright(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # orientation
@@ -295,6 +316,20 @@ def test_a_batch_keeps_what_succeeded(alone: Path) -> None:
     assert set(done.errors) == {"two", "none"}
     assert isinstance(done.errors["two"], StepBadInput) and "does not exist" in str(done.errors["none"])
     assert all((Path("all") / name / "provenance.json").exists() for name in done.assets)
+
+
+def test_a_batch_goes_on_without_a_picture_in_memory_that_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(making, "_run", lambda job, folder, engine, force: None)
+    monkeypatch.setattr(making, "load", lambda folder: Asset.__new__(Asset))
+    done = dg4d.batch([np.full((40, 40, 3), 9.0), Image.new("RGB", (40, 40)), 5], out="all")
+    assert set(done.assets) == {"picture-2"} and set(done.errors) == {"picture-1", "picture-3"}
+    assert "divide by 255" in str(done.errors["picture-1"]) and isinstance(done.errors["picture-3"], BadInput)
+
+
+@pytest.mark.parametrize("call", [{"pictures": Image.new("RGB", (4, 4))}, {"pictures": None}, {"out": 5}])
+def test_a_batch_of_what_is_not_a_list_is_refused(call: dict[str, Any]) -> None:
+    with pytest.raises(BadInput, match=r"given (Image|NoneType|int)"):
+        dg4d.batch(**{"pictures": ["fox.png"], **call})
 
 
 def test_a_batch_of_a_folder_names_items_as_the_command_does() -> None:

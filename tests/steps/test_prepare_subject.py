@@ -320,6 +320,20 @@ def test_a_box_of_one_pixel_is_refused_without_a_warning(tmp_path):
         prepare(save(tmp_path / "a.png", opaque(disc())), tmp_path / "out", box=(30, 30, 1, 1))
 
 
+def test_colored_masks_of_a_video_are_refused(tmp_path):
+    film = [frame[..., :3] for frame in walk(2)]
+    masks = zipped(tmp_path / "masks.zip", [half_mask(*film[0].shape[:2]) * np.uint8([0, 1, 0])] * 2)
+    with pytest.raises(BadInput, match="--mask is colored"):
+        prepare(zipped(tmp_path / "film.zip", film), tmp_path / "out", masks)
+
+
+def test_an_almost_transparent_mask_is_named_so(tmp_path):
+    picture = opaque(disc())
+    mask = np.dstack([picture[..., :3], half_mask(*picture.shape[:2])[..., 0] // 255])
+    with pytest.raises(BadInput, match=r"--mask is almost transparent.* must be opaque"):
+        prepare(save(tmp_path / "a.png", picture), tmp_path / "out", save(tmp_path / "m.png", mask))
+
+
 def test_one_mask_for_a_video_is_refused(tmp_path):
     film = [frame[..., :3] for frame in walk(4)]
     mask = save(tmp_path / "m.png", half_mask(*film[0].shape[:2]))

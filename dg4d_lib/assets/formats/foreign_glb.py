@@ -27,7 +27,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.mesh.models.model import Model, ModelPart, far_center, moved_note, transform_normals
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MORPHED = ("POSITION", "NORMAL", "TANGENT")  # attributes whose morph targets are read
+MORPHED = ("POSITION", "NORMAL")  # attributes whose morph targets are read
 UNREADABLE = {
     "EXT_mesh_gpu_instancing": "it has one mesh at many places (EXT_mesh_gpu_instancing); export it without instancing",
     "KHR_meshopt_compression": "it is compressed with KHR_meshopt_compression; export it without compression",
@@ -222,10 +222,11 @@ def _default_morph(
         for name in MORPHED:
             if weight and name in target and name in attributes:
                 values = found.setdefault(name, read_accessor(reader, attributes[name]).astype(np.float64))
-                values[:, :3] += float(weight) * read_accessor(reader, target[name])
+                values += float(weight) * read_accessor(reader, target[name])
     with np.errstate(all="ignore"):
-        for values in (found[name] for name in found if name != "POSITION"):
-            values[:, :3] = np.nan_to_num(values[:, :3] / np.linalg.norm(values[:, :3], axis=1, keepdims=True))
+        if "NORMAL" in found:
+            normals = found["NORMAL"]
+            found["NORMAL"] = np.nan_to_num(normals / np.linalg.norm(normals, axis=1, keepdims=True))
         return {name: values.astype(np.float32) for name, values in found.items()}
 
 

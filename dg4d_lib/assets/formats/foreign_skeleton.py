@@ -171,10 +171,10 @@ def _fitted(
         root = center + maps[0, :, :, :3] @ center + maps[0, :, :, 3]
         skeleton = replace(skeleton, rotations=maps[..., :3] + np.eye(3), root=root)
         for _ in range(ROUNDS):
-            skeleton = fit_rotations(_copy_parent_rotations_to_leaves(skeleton, empty), rest, moved, weights)
+            skeleton = fit_rotations(_copy_parent_rotations(skeleton, empty), rest, moved, weights)
     except np.linalg.LinAlgError:
         return None
-    maps = _copy_parent_rotations_to_leaves(skeleton, empty).maps()
+    maps = _copy_parent_rotations(skeleton, empty).maps()
     shown = np.einsum("nk,ktij,nj->nti", weights, maps[..., :3], rest, optimize=True)
     shown += np.einsum("nk,kti->nti", weights, maps[..., 3])
     return maps if np.square(moved - shown).sum() < np.square(moved).sum() else None
@@ -196,7 +196,7 @@ def _by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -
     return dense
 
 
-def _copy_parent_rotations_to_leaves(skeleton: Articulation, empty: Bool[np.ndarray, " k"]) -> Articulation:
+def _copy_parent_rotations(skeleton: Articulation, empty: Bool[np.ndarray, " k"]) -> Articulation:
     """Give bones that move no vertex the rotations of their parents."""
     rotations = skeleton.rotations.copy()
     for bone in np.flatnonzero(empty):

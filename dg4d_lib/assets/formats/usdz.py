@@ -3,7 +3,7 @@
 import io
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -32,7 +32,7 @@ def write_usdz_package(path: Path, stage: Usd.Stage, layer: str, files: Mapping[
         OSError: the file could not be written.
     """
     with TemporaryDirectory() as scratch:
-        entries = {layer: _encode(stage.GetRootLayer(), Path(scratch) / layer), **files}
+        entries = {layer: _encode(stage.GetRootLayer(), Path(scratch), layer), **files}
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as package:
         for name, data in entries.items():
@@ -62,10 +62,12 @@ class UsdzPackage:
             hold_s: time of the last key that is kept, seconds; readers hold its pose afterwards. None: all keys.
 
         Raises:
-            BadInput: the file is missing, not a USDZ, or has no default prim.
+            BadInput: the file is missing, not a USDZ, has compressed entries or names that lead outside of it, or has
+                no default prim.
         """
         try:
             with zipfile.ZipFile(path) as package:
+                _check_entries(path, package.infolist())
                 self.files = {name: package.read(name) for name in package.namelist()}
             stage = Usd.Stage.Open(str(path))
         except OSError as error:
@@ -81,6 +83,15 @@ class UsdzPackage:
             self.files[self.layer] = _layer_until(stage.GetRootLayer(), hold_s * self.fps, self.layer)
 
 
+def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
+    """Refuse compressed entries, which may unpack to any size, and names that lead outside of the package."""
+    for entry in entries:
+        if entry.compress_type != zipfile.ZIP_STORED:
+            raise BadInput(f"{path} has compressed entries, which USDZ forbids; give a file that dg4d wrote")
+        if {"", ".", ".."} & set(entry.filename.split("/")) or "\\" in entry.filename:
+            raise BadInput(f"{path} has an entry outside of itself, {entry.filename!r}; give a file that dg4d wrote")
+
+
 def _layer_until(layer: Sdf.Layer, end: float, name: str) -> bytes:
     """Encode a layer without the keys after a time code."""
     shortened = Sdf.Layer.CreateAnonymous(name)
@@ -92,10 +103,11 @@ def _layer_until(layer: Sdf.Layer, end: float, name: str) -> bytes:
             if key > end + SAME_KEY:
                 shortened.EraseTimeSample(path, key)
     with TemporaryDirectory() as scratch:
-        return _encode(shortened, Path(scratch) / name)
+        return _encode(shortened, Path(scratch), name)
 
 
-def _encode(layer: Sdf.Layer, file: Path) -> bytes:
-    """Write a layer to a file and return its content."""
+def _encode(layer: Sdf.Layer, scratch: Path, name: str) -> bytes:
+    """Return the content of a layer's file; the suffix of its name selects the format."""
+    file = scratch / f"layer{Path(name).suffix}"
     layer.Export(str(file))
     return file.read_bytes()

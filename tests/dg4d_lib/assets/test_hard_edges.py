@@ -1,5 +1,6 @@
 """Hard edges of a user's model, and surfaces that part: every file has the normals of the moved faces."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from dg4d_lib.asset_settings import GltfSettings
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.formats.foreign_glb import read_foreign_glb
+from dg4d_lib.assets.formats.foreign_glb import _read, read_foreign_glb
 from dg4d_lib.assets.formats.foreign_motion import TANGENTS, write_moving_glb
-from dg4d_lib.assets.formats.glb import write_glb
+from dg4d_lib.assets.formats.glb import write_frames_glb, write_glb
 from dg4d_lib.assets.formats.gltf import INDEX_DATA, VERTEX_DATA, GlbReader, GltfDocument, read_accessor
 from dg4d_lib.assets.formats.rigged import write_rigged_glb
 from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
+from dg4d_lib.assets.placement import Placement
+from dg4d_lib.mesh.extraction.simplify import simplify_mesh
+from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.models.atlas import merge_parts
 from dg4d_lib.mesh.textured import TexturedMesh
+from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 MOST = 1000  # triangles
@@ -208,3 +213,66 @@ def test_tangents_of_a_model_are_left_to_the_players():
     assert TANGENTS in notes
     (primitive,) = GlbReader(content).tree["meshes"][0]["primitives"]
     assert primitive["attributes"].keys() == {"POSITION", "NORMAL"}
+
+
+def test_morph_targets_of_tangents_are_not_read():
+    reader = GlbReader(flat_box_glb(TANGENT=np.tile(np.float32([0, 1, 0, 1]), (24, 1))))
+    (primitive,) = reader.tree["meshes"][0]["primitives"]
+    normals = primitive["attributes"]["NORMAL"]
+    reader.tree["meshes"][0].update(weights=[0.5])
+    primitive["targets"] = [{"NORMAL": normals, "TANGENT": normals}]
+    (piece,) = _read(reader, MOST).pieces
+    assert piece.morphed.keys() == {"NORMAL"}
+    np.testing.assert_allclose(piece.morphed["NORMAL"], read_accessor(reader, normals), atol=1e-6)
+
+
+def bending_ball() -> Asset4D:
+    """Return a ball that is unwrapped as an extracted mesh is, bends, and is placed in meters."""
+    ball = trimesh.creation.icosphere(3, 0.5)
+    vertices, faces = ball.vertices.astype(np.float32), np.asarray(ball.faces)
+    sources, corners, uvs = map(torch.from_numpy, unwrap(vertices, faces, 128))
+    bent = torch.from_numpy(vertices + 0.1 * np.sin(5 * vertices[:, [1, 2, 0]] + np.arange(3)[:, None, None]))
+    rest = torch.from_numpy(vertices)
+    mesh = TexturedMesh(rest[sources], corners, uvs, torch.full((8, 8, 3), 0.5))
+    placed = Placement(1.7, (0.1, 0.2, 0.3)).surface(Asset4D(mesh, (bent.float() - rest)[:, sources], 4.0))
+    assert isinstance(placed, Asset4D) and len(sources) > len(vertices)
+    return placed
+
+
+def level_of_detail(asset: Asset4D) -> Asset4D:
+    mesh, offsets = simplify_mesh(asset.mesh, asset.offsets, 400)
+    return Asset4D(mesh, offsets, asset.fps)
+
+
+@pytest.mark.parametrize(
+    ("write", "targets"),
+    [
+        (write_glb, (None, 0, 1)),
+        (lambda asset: write_glb(asset, GltfSettings(meshopt=True)), (None, 0, 1)),
+        (lambda asset: write_glb(level_of_detail(asset)), (None, 0, 1)),
+        (lambda asset: write_rigged_glb(asset, rig_of(asset), GltfSettings()), (None,)),
+        (lambda asset: write_frames_glb([asset.mesh], 4.0), (None,)),
+    ],
+)
+def test_an_extracted_mesh_stays_smooth_across_the_seams_of_its_texture(
+    write: Callable[[Asset4D], bytes], targets: tuple[int | None, ...]
+):
+    content = write(bending_ball())
+    _, copies = group_vertices(shown(content, None)[0])
+    assert copies.max() + 1 < len(copies)
+    for target in targets:
+        _, normals, _ = shown(content, target)
+        _, first = np.unique(copies, return_index=True)
+        np.testing.assert_array_equal(normals, normals[first][copies])
+
+
+@pytest.mark.parametrize("skinned", [False, True])
+def test_the_seams_of_an_extracted_mesh_are_one_point_each_in_usdz(skinned: bool, tmp_path: Path):
+    asset, path = bending_ball(), tmp_path / "a.usdz"
+    if skinned:
+        write_skinned_usdz(path, asset, rig_of(asset))
+    else:
+        write_usdz(path, asset, 4.0)
+    stage = Usd.Stage.Open(str(path))
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/mesh/subject")).GetPointsAttr().Get(0)
+    assert len(points) == len(group_vertices(asset.mesh.vertices.numpy())[0])

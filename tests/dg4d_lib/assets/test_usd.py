@@ -417,6 +417,23 @@ def test_a_usdz_that_a_scene_cannot_refer_to_is_refused(path: Path) -> None:
         compose_usdz(path, [UsdPlacement("x", path.parent / "empty.usdz", at())])
 
 
+@pytest.mark.parametrize(
+    ("name", "method", "says"),
+    [
+        ("../../stolen.usdc", zipfile.ZIP_STORED, "outside of itself"),
+        ("/tmp/stolen.usdc", zipfile.ZIP_STORED, "outside of itself"),
+        ("asset.usdc", zipfile.ZIP_DEFLATED, "compressed entries"),
+    ],
+)
+def test_a_usdz_with_unsafe_entries_is_refused(name: str, method: int, says: str, path: Path) -> None:
+    sound = two_assets(path.parent)[0].file
+    hostile = path.parent / "hostile.usdz"
+    with zipfile.ZipFile(sound) as package, zipfile.ZipFile(hostile, "w", method) as other:
+        other.writestr(name, package.read(package.namelist()[0]))
+    with pytest.raises(BadInput, match=says):
+        compose_usdz(path, [UsdPlacement("x", hostile, at(), hold_s=0.0)])
+
+
 def test_an_empty_scene_is_refused(path: Path) -> None:
     with pytest.raises(BadInput, match="at least one asset"):
         compose_usdz(path, [])

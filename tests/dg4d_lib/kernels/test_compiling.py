@@ -18,11 +18,11 @@ def stamp(tmp_path, monkeypatch):
     monkeypatch.setattr(compiling, "_ROOT", tmp_path)
     (tmp_path / "ours").mkdir()
 
-    def make(locator, source: str, **modules: str):
+    def make(locator, source: str, head: str = f"import {compiling.__name__}\n", **modules: str):
         compiling._digest.cache_clear()
         for name, text in modules.items():
             (tmp_path / "ours" / f"{name}.py").write_text(text)
-        (tmp_path / "ours" / "kernel.py").write_text(source)
+        (tmp_path / "ours" / "kernel.py").write_text(head + source)
         return locator(lambda: None, str(tmp_path / "ours" / "kernel.py")).get_source_stamp()
 
     yield make
@@ -49,6 +49,8 @@ def test_what_an_imported_kernel_imports_counts(locator, stamp):
 @pytest.mark.parametrize("locator", LOCATORS)
 def test_a_kernel_that_stands_alone_depends_on_its_own_file_only(locator, stamp):
     assert stamp(locator, "x = 1", size="BLUR = 0.3") == stamp(locator, "x = 1", size="BLUR = 0.4")
+    others = "from ours.size import BLUR"  # of another package, whose kernels are not called by ours
+    assert stamp(locator, others, "", size="BLUR = 0.3") == stamp(locator, others, "", size="BLUR = 0.4")
     assert stamp(locator, "x = 1") != stamp(locator, "x = 22")
 
 

@@ -272,6 +272,23 @@ def test_slots_and_queues_are_in_the_folder_that_the_variable_names(
     assert names == {"gpu-0.lock", "queue-gpu"}
 
 
+@pytest.mark.parametrize(("name", "says"), [("file", "File exists"), ("file/slots", "Not a directory")])
+def test_slots_where_no_folder_can_be_are_refused(
+    name: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DG4D_SLOTS", str(tmp_path / name))
+    with pytest.raises(BadInput, match=rf"\$DG4D_SLOTS is .*{says}; set it to a folder"), slot("cpu", silent):
+        pass
+
+
+def test_slots_in_a_folder_of_somebody_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DG4D_SLOTS", str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # the tests may run as root
+    with pytest.raises(BadInput, match=r"\$DG4D_SLOTS is .*no permission"), slot("cpu", silent):
+        pass
+
+
 def test_a_relative_folder_of_slots_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_SLOTS", "slots")
     with pytest.raises(BadInput, match="'slots'; set it to an absolute path"), slot("cpu", silent):

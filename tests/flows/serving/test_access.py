@@ -213,6 +213,14 @@ def test_a_browser_keeps_a_secret_that_the_server_accepted(given: str, status: i
     assert run_node("login.mjs", json.dumps(asked)) == {"kept": word[kept], "left": left}
 
 
+@pytest.mark.parametrize("given", ["dg4d:50%25", "dg4d:50%"])
+def test_a_percent_sign_in_a_secret_may_be_written_as_it_is(given: str) -> None:
+    page = Path(access.__file__).with_name("login.html")
+    asked = {"page": str(page), "hash": f"#{given}", "kept": "", "status": 204}
+    kept = basic("dg4d:50%").removeprefix("Basic ")
+    assert run_node("login.mjs", json.dumps(asked)) == {"kept": kept, "left": True}
+
+
 def test_further_hosts_are_named_by_the_environment_and_never_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DG4D_SERVER_HOSTS", "server, dg4d.example.com,*,")
     assert access.allowed_hosts() == [*access.LOCAL_HOSTS, "server", "dg4d.example.com"]
