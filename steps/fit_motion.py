@@ -18,7 +18,7 @@ from steps.fitting.reporting import SHOWN_AZIMUTHS_DEG, LossCurves, picture_of_d
 from steps.fitting.tracking import TRACKED_NOTE, SurfaceTracker, most_iterations, tracks_surface
 from steps.runtime.job import Job, StepReport
 
-STRAYS = "Removed {} stray Gaussians that separated from the moving subject."
+STRAYS = "Stray Gaussians that separated from the moving subject were removed: {}."
 FINE_TUNED = "The canonical Gaussians were optimized together with the deformation, on all frames."
 PICTURE_FRAMES = 6
 STATES = 16  # at once in the memory, where strays are searched

@@ -19,7 +19,7 @@ def read(folder: Path, content: bytes) -> Source:
 def test_frames_that_the_header_invents_are_not_waited_for(tmp_path: Path) -> None:
     source = read(tmp_path, VIDEOS["mp4: a billion frames of times"]())
     assert len(source.frames) == 4
-    assert "promises 1073741824 frames; 4 can be read" in source.notes[0]
+    assert "declares 1073741824 frames; 4 can be read" in source.notes[0]
 
 
 def test_frames_that_grow_on_the_way_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

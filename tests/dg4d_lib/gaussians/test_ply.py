@@ -106,10 +106,10 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda content: b"", "no PLY"),
-        (lambda content: b"a text file", "no PLY"),
+        (lambda content: b"", "not a PLY"),
+        (lambda content: b"a text file", "not a PLY"),
         (lambda content: content[:-1], "truncated: 7 Gaussians declared, 6 found"),
-        (lambda content: content[:100], "no PLY"),
+        (lambda content: content[:100], "not a PLY"),
         (lambda content: content.replace(b"opacity", b"opacitx"), "lacks opacity"),
         (lambda content: content.replace(b"binary_little_endian", b"ascii"), "binary_little_endian"),
         (lambda content: content.replace(b"vertex 7", b"vertex x"), "header"),
