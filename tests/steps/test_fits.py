@@ -122,7 +122,7 @@ def test_a_motion_comes_out_of_gaussians_and_a_video(tmp_path: Path, subject: Pa
     facts = fit_motion.run(work)
     before, after = read_ply(gaussians), read_ply(work.outputs["gaussians"])
     assert len(before) == len(after) and not torch.equal(before.harmonics, after.harmonics)
-    assert "together with their motion" in facts.notes[-1]
+    assert facts.notes[-1] == fit_motion.FINE_TUNED
 
 
 def test_gaussians_that_tear_away_are_dropped_with_their_motion(
