@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -23,7 +24,7 @@ AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its
 
 
 class VertexGroups(NamedTuple):
-    """Vertices at equal positions, which texture seams split.
+    """Vertices that share a normal: copies of one vertex along texture seams.
 
     Attributes:
         first: one vertex of every group.
@@ -148,5 +149,9 @@ def smooth_normals(mesh: TexturedMesh, groups: VertexGroups | None = None) -> Fl
 
 
 def vertex_groups(mesh: TexturedMesh) -> VertexGroups:
-    """Return which vertices of a mesh have equal positions."""
-    return VertexGroups(*map(torch.from_numpy, group_vertices(mesh.vertices.numpy())))
+    """Return which vertices of a mesh have equal positions, and are in one smoothing group."""
+    first, group = group_vertices(mesh.vertices.numpy())
+    if mesh.smoothing_groups is not None:
+        both = np.stack([group, mesh.smoothing_groups.numpy()], 1)
+        _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    return VertexGroups(torch.from_numpy(first), torch.from_numpy(group.ravel()))

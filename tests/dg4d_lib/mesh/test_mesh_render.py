@@ -25,6 +25,19 @@ def board() -> TexturedMesh:
     return TexturedMesh(0.5 * HALF * corners, torch.tensor([[0, 3, 2], [0, 2, 1]]), uvs, texture)
 
 
+def test_an_edge_between_smoothing_groups_is_hard() -> None:
+    box = trimesh.creation.box()
+    corners = torch.tensor(box.triangles.reshape(-1, 3), dtype=torch.float32)
+    faces = torch.arange(36).reshape(12, 3)
+    flat = torch.tensor(box.face_normals, dtype=torch.float32)
+    sides = (flat @ torch.tensor([1.0, 2.0, 3.0])).round().long().repeat_interleave(3)
+    mesh = TexturedMesh(corners, faces, torch.zeros(36, 2), torch.ones(1, 1, 3))
+    smooth = render.smooth_normals(mesh)
+    assert (smooth * flat.repeat_interleave(3, 0)).sum(1).max() < 0.9
+    hard = render.smooth_normals(replace(mesh, smoothing_groups=sides))
+    torch.testing.assert_close(hard, flat.repeat_interleave(3, 0))
+
+
 def test_the_top_left_of_the_texture_is_the_top_left_of_the_picture(board: TexturedMesh) -> None:
     color, alpha = render_mesh(board, [CAMERA])
     for (row, column), expected in {(9, 9): (1, 0, 0), (9, 22): (0, 1, 0), (22, 9): (0, 0, 1)}.items():
