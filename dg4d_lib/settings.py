@@ -406,7 +406,9 @@ class MotionSettings(FitSettings):
         "frame (ours)",
     )
     trackings: Literal[1, 3] = Field(
-        3, description="number of different trackings of that surface; 1: faster by a minute or two (ours)"
+        3,
+        description="number of different trackings of that surface, 4 of one with 12 views or more; "
+        "1: faster by a minute or two (ours)",
     )
     fine_tune: bool = Field(False, description="optimize the canonical Gaussians too (paper: no; public code: yes)")
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")

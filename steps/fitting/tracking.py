@@ -34,13 +34,13 @@ from steps.fitting.priors import Tracked
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, tracked through the video"
 FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views
-SOFT = DESCENT.model_copy(  # for hulls of few views, whose limbs may touch
-    update={"across": AssetSettings().across, "whole_depth": 0.02}
-)
-SWING = swinging(SOFT)  # for what loses the outline
+HINGE = DESCENT.model_copy(update={"across": AssetSettings().across, "whole_depth": 0.02})  # for lids
+SOFT = HINGE.model_copy(update={"size": 192, "rigidity": 0.6})  # for hulls of few views, whose limbs may touch
+SWING = swinging(SOFT).model_copy(update={"rigidity": 1.0})  # for what loses the outline
 BESIDE_SOFT = (SWING, FLOW)  # for what keeps it
-BESIDE_FLOW = (FLOW.model_copy(update={"rigidity_loss": "log"}), SOFT)  # likewise
-SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (0.3, 1.0))  # beside SWING
+BENT = tuple(FLOW.model_copy(update={"rigidity_loss": "log", "size": size}) for size in (112, 144))
+BESIDE_FLOW = (*BENT, SOFT)  # likewise
+SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (2.0, 4.0))  # beside SWING
 CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
 CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
@@ -82,9 +82,9 @@ class SurfaceTracker:
 
     If the motion is that of a lid or a door on a hinge, the fit of the hinge is the answer. Else a surface that loses
     the outline, or that flow follows badly, is tracked a second time, with limbs that swing; `swinging_is_better`
-    chooses between the two motions. Surfaces are then tracked in two more ways, whose errors at unseen sides differ:
-    softer and stiffer where limbs swing; else hulls of few pictures by flow and with limbs that swing, those of many
-    by flow with few joints that bend a lot, and by descent.
+    chooses between the two motions. Surfaces are then tracked in two or three more ways, whose errors at unseen sides
+    differ: two stiffer ones where limbs swing; else hulls of few pictures by flow and with limbs that swing, those of
+    many by flow with few joints that bend a lot, in two sizes of the pictures, and by descent.
     """
 
     def __init__(
@@ -101,13 +101,13 @@ class SurfaceTracker:
 
         Args:
             known: views of the first frame.
-            trackings: 1, or 3 for the other ways.
+            trackings: 1, or 3 for all ways.
         """
         self._gaussians, self._video, self._rasterize, self._generator = gaussians, video, rasterize, generator
         self._first = tracking_of(known)
         self._several = trackings > 1
         self._most, self._report = most_iterations(known, video, trackings), report
-        self._numbers, self._done = count(), [0] * (3 + len(SWINGS))  # iterations of every tracking
+        self._numbers, self._done = count(), [0] * (3 + len(BESIDE_FLOW))  # iterations of every tracking
         self._here = threading.get_ident()  # callbacks of a job belong to its thread
         self.hinged: Hinged | None = None  # what a call found
 
@@ -153,7 +153,7 @@ class SurfaceTracker:
 
     def _on_a_hinge(self, free: MovedSurfaces) -> Hinged | None:
         surfaces = [free.surface(frame) for frame in range(len(self._video))]
-        return track_hinge(surfaces, self._gaussians, self._video, self._rasterize, SOFT, self._next_report())
+        return track_hinge(surfaces, self._gaussians, self._video, self._rasterize, HINGE, self._next_report())
 
     def _next_report(self) -> Report:
         """Return what one more fit reports its iterations to."""

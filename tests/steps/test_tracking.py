@@ -29,9 +29,10 @@ WAYS = {
     "soft": SOFT,
     "flow": FLOW,
     "bent": BESIDE_FLOW[0],
+    "larger": BESIDE_FLOW[1],
     "swing": SWING,
-    "softer": SWINGS[0],
-    "stiffer": SWINGS[1],
+    "stiffer": SWINGS[0],
+    "stiffest": SWINGS[1],
 }
 
 
@@ -62,15 +63,25 @@ ALL_AROUND = list(range(0, 360, 20))
         ([90, 180], {"soft": 0.0}, 1, ["soft"]),
         ([90, 180], {"soft": 0.0, "swing": 0.1, "flow": 0.05}, 3, ["soft", "swing", "flow"]),
         ([90, 180], {"soft": 0.1, "swing": 0.1}, 1, ["swing"]),
-        ([90], {"soft": 0.1, "swing": 0.1, "softer": 0.0, "stiffer": 0.02}, 3, ["swing", "softer", "stiffer"]),
+        ([90], {"soft": 0.1, "swing": 0.1, "stiffer": 0.0, "stiffest": 0.02}, 3, ["swing", "stiffer", "stiffest"]),
         ([180], {"soft": 0.1, "swing": 0.11}, 1, ["swing"]),  # lost: a smaller overlap does not tell
         ([90, 180], {"soft": 0.1, "swing": 0.3}, 3, ["soft"]),  # far smaller
         (ALL_AROUND, {"flow": 0.0}, 1, ["flow"]),
-        (ALL_AROUND, {"flow": 0.0, "bent": 0.1, "soft": 0.05}, 3, ["flow", "bent", "soft"]),
+        (ALL_AROUND, {"flow": 0.0, "bent": 0.1, "larger": 0.08, "soft": 0.05}, 3, ["flow", "bent", "larger", "soft"]),
         (ALL_AROUND, {"flow": 0.03, "swing": 0.0}, 1, ["swing"]),
         (ALL_AROUND, {"flow": 0.03, "swing": 0.03}, 1, ["flow"]),  # not lost, and no gain
-        (ALL_AROUND, {"flow": 0.03, "swing": 0.03, "bent": 0.0, "soft": 0.0}, 3, ["flow", "bent", "soft"]),
-        (ALL_AROUND, {"flow": 0.1, "swing": 0.11, "softer": 0.0, "stiffer": 0.02}, 3, ["swing", "softer", "stiffer"]),
+        (
+            ALL_AROUND,
+            {"flow": 0.03, "swing": 0.03, "bent": 0.0, "larger": 0.0, "soft": 0.0},
+            3,
+            ["flow", "bent", "larger", "soft"],
+        ),
+        (
+            ALL_AROUND,
+            {"flow": 0.1, "swing": 0.11, "stiffer": 0.0, "stiffest": 0.02},
+            3,
+            ["swing", "stiffer", "stiffest"],
+        ),
         (ALL_AROUND, {"flow": 0.1, "swing": 0.3}, 3, ["flow"]),  # lost in both
     ],
 )
