@@ -26,27 +26,15 @@ def nearest_rotation(m, rotation):
     bc, bd, cd = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
     of_a, of_b, of_c, of_d = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     for _ in range(SWEEPS):
-        turned = False
-        if _is_off(a, b, ab):
-            a, b, ab, ac, bc, ad, bd, of_a, of_b = _without(a, b, ab, ac, bc, ad, bd, of_a, of_b)
-            turned = True
-        if _is_off(a, c, ac):
-            a, c, ac, ab, bc, ad, cd, of_a, of_c = _without(a, c, ac, ab, bc, ad, cd, of_a, of_c)
-            turned = True
-        if _is_off(a, d, ad):
-            a, d, ad, ab, bd, ac, cd, of_a, of_d = _without(a, d, ad, ab, bd, ac, cd, of_a, of_d)
-            turned = True
-        if _is_off(b, c, bc):
-            b, c, bc, ab, ac, bd, cd, of_b, of_c = _without(b, c, bc, ab, ac, bd, cd, of_b, of_c)
-            turned = True
-        if _is_off(b, d, bd):
-            b, d, bd, ab, ad, bc, cd, of_b, of_d = _without(b, d, bd, ab, ad, bc, cd, of_b, of_d)
-            turned = True
-        if _is_off(c, d, cd):
-            c, d, cd, ac, ad, bc, bd, of_c, of_d = _without(c, d, cd, ac, ad, bc, bd, of_c, of_d)
-            turned = True
-        if not turned:
+        of_first = _is_off(a, b, ab) or _is_off(a, c, ac) or _is_off(a, d, ad)
+        if not (of_first or _is_off(b, c, bc) or _is_off(b, d, bd) or _is_off(c, d, cd)):
             break
+        a, b, ab, ac, bc, ad, bd, of_a, of_b = _decoupled(a, b, ab, ac, bc, ad, bd, of_a, of_b)
+        a, c, ac, ab, bc, ad, cd, of_a, of_c = _decoupled(a, c, ac, ab, bc, ad, cd, of_a, of_c)
+        a, d, ad, ab, bd, ac, cd, of_a, of_d = _decoupled(a, d, ad, ab, bd, ac, cd, of_a, of_d)
+        b, c, bc, ab, ac, bd, cd, of_b, of_c = _decoupled(b, c, bc, ab, ac, bd, cd, of_b, of_c)
+        b, d, bd, ab, ad, bc, cd, of_b, of_d = _decoupled(b, d, bd, ab, ad, bc, cd, of_b, of_d)
+        c, d, cd, ac, ad, bc, bd, of_c, of_d = _decoupled(c, d, cd, ac, ad, bc, bd, of_c, of_d)
     largest, (w, x, y, z) = a, of_a
     if b > largest:
         largest, (w, x, y, z) = b, of_b
@@ -70,8 +58,10 @@ def _is_off(p, q, pq):
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _without(p, q, pq, pr, qr, ps, qs, of_p, of_q):
-    """Rotate two axes so that they are coupled no more; return the new elements, and the vectors of both axes."""
+def _decoupled(p, q, pq, pr, qr, ps, qs, of_p, of_q):
+    """Rotate two coupled axes until they are not; return the new elements, and the vectors of both axes."""
+    if not _is_off(p, q, pq):
+        return p, q, pq, pr, qr, ps, qs, of_p, of_q
     tau = (q - p) / (2 * pq)
     t = (1.0 if tau >= 0 else -1.0) / (abs(tau) + np.sqrt(1 + tau * tau))
     c = 1 / np.sqrt(1 + t * t)

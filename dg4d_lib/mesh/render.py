@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,7 +11,7 @@ from torch.nn.functional import avg_pool2d, normalize
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.geometry.normals import vertex_normals
-from dg4d_lib.mesh.extraction.topology import group_vertices
+from dg4d_lib.mesh.extraction.topology import group_labels, group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.texture_cpu import MipLevels, Rasterized, mip_levels, texture_colors
@@ -152,6 +151,5 @@ def vertex_groups(mesh: TexturedMesh) -> VertexGroups:
     """Return which vertices of a mesh have equal positions, and are in one smoothing group."""
     first, group = group_vertices(mesh.vertices.numpy())
     if mesh.smoothing_groups is not None:
-        both = np.stack([group, mesh.smoothing_groups.numpy()], 1)
-        _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    return VertexGroups(torch.from_numpy(first), torch.from_numpy(group.ravel()))
+        first, group = group_labels(group, mesh.smoothing_groups.numpy())
+    return VertexGroups(torch.from_numpy(first), torch.from_numpy(group))

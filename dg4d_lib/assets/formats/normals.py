@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from dg4d_lib.mesh.extraction.topology import face_components, group_vertices
+from dg4d_lib.mesh.extraction.topology import face_components, group_labels, group_vertices
 from dg4d_lib.mesh.textured import TexturedMesh
 
 
@@ -61,8 +61,8 @@ def normal_groups(
     welded = point_of[faces]
     surface_of = np.zeros(len(kept), np.int64)
     surface_of[welded] = face_components(len(kept), welded)[:, None]
-    columns = [group_vertices(states[0])[1], surface_of[point_of], *([] if smoothing is None else [smoothing])]
-    return np.unique(np.stack(columns, 1), axis=0, return_inverse=True)[1].ravel()
+    labels = [group_vertices(states[0])[1], surface_of[point_of], *([] if smoothing is None else [smoothing])]
+    return group_labels(*labels)[1]
 
 
 def weld(

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from pxr import Gf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol
 
 from dg4d_lib.assets.formats.usd_colors import WHITE, Decode, UsdColor, UsdMaterials
+from dg4d_lib.assets.formats.usdz import check_entries
 from dg4d_lib.errors import BadInput, listed
 from dg4d_lib.mesh.models.model import Model, ModelPart, single_precision, too_many_triangles
 from dg4d_lib.mesh.models.polygons import triangulate
 
-MAX_ENTRIES, MAX_PRIMS = 1000, 100_000
+MAX_PRIMS = 100_000
 GRAY = (0.5, 0.5, 0.5)  # of a material without a readable color, linear
 MOST_NAMED = 5  # objects in a note
 _BROKEN = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError)  # the last one by pxr
@@ -35,14 +36,7 @@ def check_usdz(path: Path) -> None:
             entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise BadInput(f"the USDZ is broken ({error}); export it again") from error
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise BadInput("the USDZ has compressed entries, which the format forbids; export it again")
-    size, inside = path.stat().st_size, sum(entry.file_size for entry in entries)
-    if len(entries) > MAX_ENTRIES or inside > size:
-        raise BadInput(
-            f"the USDZ declares {len(entries)} files with {inside} bytes in {size} bytes of archive; at most "
-            f"{MAX_ENTRIES} files without overlap are read: export it again"
-        )
+    check_entries(entries, path.stat().st_size, "the USDZ")
 
 
 def read_usd(path: Path, decode: Decode, max_faces: int) -> Model:

@@ -15,6 +15,7 @@ ALIGNMENT = 64  # bytes; alignment of every file's content (USDZ specification)
 HEADER = 30  # bytes of a local file header before the name
 EXTRA_HEADER = 4  # bytes of an extra field before its content
 PADDING = 0x1986  # id of the extra field that OpenUSD uses for padding
+MAX_ENTRIES = 1000
 SAME_KEY = 0.01  # time codes, below the distance of any two keys; times of a GLB have single precision
 UNIX = 3  # "created by" system of the zip, fixed so that all platforms write equal bytes
 
@@ -62,12 +63,13 @@ class UsdzPackage:
             hold_s: time of the last key that is kept, seconds; readers hold its pose afterwards. None: all keys.
 
         Raises:
-            BadInput: the file is missing, not a USDZ, has compressed entries or names that lead outside of it, or has
-                no default prim.
+            BadInput: the file is missing, not a USDZ, has entries that `check_entries` refuses or names that lead
+                outside of it, or has no default prim.
         """
         try:
             with zipfile.ZipFile(path) as package:
-                _check_entries(path, package.infolist())
+                check_entries(package.infolist(), path.stat().st_size, str(path))
+                _check_names(path, package.namelist())
                 self.files = {name: package.read(name) for name in package.namelist()}
             stage = Usd.Stage.Open(str(path))
         except OSError as error:
@@ -83,13 +85,32 @@ class UsdzPackage:
             self.files[self.layer] = _layer_until(stage.GetRootLayer(), hold_s * self.fps, self.layer)
 
 
-def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
-    """Refuse compressed entries, which may unpack to any size, and names that lead outside of the package."""
-    for entry in entries:
-        if entry.compress_type != zipfile.ZIP_STORED:
-            raise BadInput(f"{path} has compressed entries, which USDZ forbids; give a file that dg4d wrote")
-        if {"", ".", ".."} & set(entry.filename.split("/")) or "\\" in entry.filename:
-            raise BadInput(f"{path} has an entry outside of itself, {entry.filename!r}; give a file that dg4d wrote")
+def check_entries(entries: Sequence[zipfile.ZipInfo], size: int, what: str) -> None:
+    """Refuse compressed or overlapping entries, with which a small file unpacks to any size, and too many.
+
+    Args:
+        entries: of the archive.
+        size: of the file, bytes.
+        what: the file, for messages.
+
+    Raises:
+        BadInput: says why.
+    """
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise BadInput(f"{what} has compressed entries, which USDZ forbids; export it again")
+    inside = sum(entry.file_size for entry in entries)
+    if len(entries) > MAX_ENTRIES or inside > size:
+        raise BadInput(
+            f"{what} declares {len(entries)} files with {inside} bytes in {size} bytes of archive; at most "
+            f"{MAX_ENTRIES} files without overlap are read: export it again"
+        )
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    """Refuse names of entries that lead outside of the package."""
+    for name in names:
+        if {"", ".", ".."} & set(name.split("/")) or "\\" in name:
+            raise BadInput(f"{path} has an entry outside of itself, {name!r}; give a file that dg4d wrote")
 
 
 def _layer_until(layer: Sdf.Layer, end: float, name: str) -> bytes:

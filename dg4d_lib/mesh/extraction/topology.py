@@ -113,6 +113,12 @@ def group_vertices(
     return first, index.ravel()
 
 
+def group_labels(*labels: Int[np.ndarray, " v"]) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, " v"]]:
+    """Return the first vertex of every combination of labels, and the combination of every vertex, from 0."""
+    _, first, group = np.unique(np.stack(labels, 1), axis=0, return_index=True, return_inverse=True)
+    return first, group.ravel()
+
+
 def orient_outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3"]:
     """Flip the faces of inverted components; the triangles of a component must be consistently oriented."""
     components = face_components(len(vertices), faces)

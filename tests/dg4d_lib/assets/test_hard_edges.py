@@ -126,14 +126,19 @@ def test_hard_edges_stay_hard_with_a_skeleton():
     assert worst_angle_deg(*shown(write_rigged_glb(asset, rig_of(asset), GltfSettings()), None)) < 1
 
 
-@pytest.mark.parametrize("skinned", [False, True])
-def test_hard_edges_stay_hard_in_usdz(skinned: bool, tmp_path: Path):
-    asset, path = merged_box(), tmp_path / "a.usdz"
+def written(path: Path, asset: Asset4D, skinned: bool) -> Usd.Stage:
+    """Write an asset as USDZ, with a skeleton or with points per frame, and open it."""
     if skinned:
         write_skinned_usdz(path, asset, rig_of(asset))
     else:
         write_usdz(path, asset, 4.0)
-    stage = Usd.Stage.Open(str(path))
+    return Usd.Stage.Open(str(path))
+
+
+@pytest.mark.parametrize("skinned", [False, True])
+def test_hard_edges_stay_hard_in_usdz(skinned: bool, tmp_path: Path):
+    asset, path = merged_box(), tmp_path / "a.usdz"
+    stage = written(path, asset, skinned)
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/mesh/subject"))
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(0)).reshape(-1, 3)
     assert len(mesh.GetPointsAttr().Get(0)) == 24
@@ -269,10 +274,6 @@ def test_an_extracted_mesh_stays_smooth_across_the_seams_of_its_texture(
 @pytest.mark.parametrize("skinned", [False, True])
 def test_the_seams_of_an_extracted_mesh_are_one_point_each_in_usdz(skinned: bool, tmp_path: Path):
     asset, path = bending_ball(), tmp_path / "a.usdz"
-    if skinned:
-        write_skinned_usdz(path, asset, rig_of(asset))
-    else:
-        write_usdz(path, asset, 4.0)
-    stage = Usd.Stage.Open(str(path))
+    stage = written(path, asset, skinned)
     points = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/mesh/subject")).GetPointsAttr().Get(0)
     assert len(points) == len(group_vertices(asset.mesh.vertices.numpy())[0])

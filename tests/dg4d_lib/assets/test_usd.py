@@ -434,6 +434,15 @@ def test_a_usdz_with_unsafe_entries_is_refused(name: str, method: int, says: str
         compose_usdz(path, [UsdPlacement("x", hostile, at(), hold_s=0.0)])
 
 
+def test_a_usdz_whose_entries_overlap_is_refused(path: Path) -> None:
+    sound, hostile = two_assets(path.parent)[0].file, path.parent / "hostile.usdz"
+    with zipfile.ZipFile(sound) as package, zipfile.ZipFile(hostile, "w") as other:
+        other.writestr("asset.usdc", package.read(package.namelist()[0]))
+        other.filelist += other.filelist  # the directory lists the entry twice
+    with pytest.raises(BadInput, match="without overlap"):
+        compose_usdz(path, [UsdPlacement("x", hostile, at())])
+
+
 def test_an_empty_scene_is_refused(path: Path) -> None:
     with pytest.raises(BadInput, match="at least one asset"):
         compose_usdz(path, [])
