@@ -1,6 +1,9 @@
 """Shape of a subject from its known views."""
 
+import math
 from collections.abc import Sequence
+
+import numpy as np
 
 from dg4d_lib.visual_hull.carve import Volume, hull
 from dg4d_lib.visual_hull.columns import bounded, fitting_turn
@@ -9,8 +12,11 @@ from dg4d_lib.visual_hull.known import CARVES, KnownView, shows_sides
 from dg4d_lib.visual_hull.probable import Predict, probable
 
 CELLS = 128  # along the longest side of the subject
+FINEST_CELLS = 192  # likewise, of thin subjects; a cell is about a pixel of the input then
+FEW_VERTICES = 40_000  # of a surface: with fewer, cells may be smaller
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
-LENIENCE = 0.5  # cells by which silhouettes of drawn views are wider: these are a little wrong
+LENIENCE = 0.5  # of `CELLS` by which silhouettes of drawn views are wider: these are a little wrong
+NEARLY = 0.5  # likewise, by which a place may violate silhouettes more than the best one behind its pixel
 
 
 def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> Volume:
@@ -30,9 +36,23 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
         volume = hull(carving, CELLS)
         return probable(volume, views, predict) if predict is not None else volume
     if shows_sides([view.camera for view in carving]):
-        return covering(hull(carving, CELLS, reach=REACH, lenience=LENIENCE), views[0])
+        volume = hull(carving, CELLS, reach=REACH, lenience=LENIENCE)
+        cells = fitting_cells(volume)
+        if cells > CELLS:
+            volume = hull(carving, cells, reach=REACH, lenience=LENIENCE * cells / CELLS)
+        return covering(volume, views[0], NEARLY * cells / CELLS)
     columns = bounded(hull(carving, CELLS, reach=REACH), carving, fitting_turn(carving))
-    return covering(columns, views[0])
+    return covering(columns, views[0], NEARLY)
+
+
+def fitting_cells(volume: Volume) -> int:
+    """Return the number of cells for a subject whose hull has `CELLS`.
+
+    Thin subjects need smaller cells, and their surface is small for their size.
+    """
+    inside = volume.values > 0
+    vertices = sum(int(np.count_nonzero(np.diff(inside, axis=axis))) for axis in range(3))  # of marching cubes
+    return round(min(max(CELLS, CELLS * math.sqrt(FEW_VERTICES / max(1, vertices))), FINEST_CELLS))
 
 
 def leaves_doubt(views: Sequence[KnownView]) -> bool:
