@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dg4d_lib.cameras.orbit import FOV_Y_DEG, OrbitCamera
 from dg4d_lib.images import over_white
-from dg4d_lib.mesh.render import render_lit
+from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from flows.convert import connect
 from flows.serving import background
@@ -47,6 +47,7 @@ def write_animation(package: Path, path: Path) -> None:
     manifest = read_manifest(package)
     states, surface = read_states(package, manifest), read_surface(package, manifest)
     draw = get_rasterizer("auto")
+    renderer = LitRenderer()
     fov_y_deg = manifest.camera.whole_fov_y_deg or FOV_Y_DEG
     subject = _subject(package, math.tan(math.radians(FOV_Y_DEG / 2)) / math.tan(math.radians(fov_y_deg / 2)))
     count = round(LOOPS * manifest.frames / manifest.fps * FPS)
@@ -56,7 +57,7 @@ def write_animation(package: Path, path: Path) -> None:
         sway_deg = SWAY_DEG * math.sin(2 * math.pi * k / count)
         camera = OrbitCamera(8.0, sway_deg, fov_y_deg=fov_y_deg, width=SIZE, height=SIZE)
         splats = draw(states(position), [camera], torch.ones(3)).color[0]
-        mesh = over_white(torch.cat(render_lit(mesh_at(surface, position[0]), camera), -1))
+        mesh = over_white(torch.cat(renderer.render(mesh_at(surface, position[0]), camera), -1))
         panels = [np.asarray(subject), _bytes(mesh), _bytes(splats)]
         pictures.append(Image.fromarray(np.concatenate(panels, axis=1)))
     pictures[0].save(

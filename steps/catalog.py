@@ -59,8 +59,8 @@ TRACKED = _port("tracked", "safetensors")
 MESHES = _port("meshes", "zip")
 CURVES = _port("curves", "json")
 RANKING = _port("ranking", "json")
-FILMS = _port("films", "zip")
-TRUTH = _port("truth", "zip")
+VIDEOS = _port("films", "zip")
+GROUND_TRUTH = _port("truth", "zip")
 GATES = _port("gates", "json")
 SCORES = _port("scores", "json")
 PACKAGE = _port("package", "zip")
@@ -129,7 +129,7 @@ STEPS: dict[str, StepSpec] = {
                 "picture": PNG,
                 "candidates": _optional(PNG),
                 "ranking": _optional(RANKING),
-                "films": _optional(FILMS),
+                "films": _optional(VIDEOS),
             },
             sections=("driving", "subject.turn_deg"),
             resource="gpu",
@@ -226,7 +226,7 @@ STEPS: dict[str, StepSpec] = {
         _step("join_meshes", {"meshes": MESHES.model_copy(update={"many": True})}, {"meshes": MESHES}),
         _step(
             "refine_texture",
-            inputs={**EITHER_MESH, "driving_video": FRAMES},
+            inputs={**EITHER_MESH, "subject": PNG, "driving_video": FRAMES},
             outputs=EITHER_MESH,
             sections=("refiner",),
             resource="gpu",
@@ -252,8 +252,8 @@ STEPS: dict[str, StepSpec] = {
         ),
         _step(
             "score_asset",
-            inputs={"package": _optional(PACKAGE), "truth": TRUTH},
-            outputs={"scores": SCORES, "films": FILMS},
+            inputs={"package": _optional(PACKAGE), "truth": GROUND_TRUTH},
+            outputs={"scores": SCORES, "films": VIDEOS},
             settings="steps.profiles:ScoreAssetSettings",
             resource="gpu",
         ),

@@ -27,8 +27,8 @@ from steps.sources.placing import place_pictures
 from steps.sources.reader import Source, read_source
 from steps.sources.views import CLOSE_DEG, GivenView, GivenViews, read_views
 
-TURNTABLE_FRAMES = 24  # of a turntable are used
-FEWEST_FRAMES = 8  # of a turntable
+TURNTABLE_FRAMES = 24  # largest number of used frames of a turntable
+FEWEST_FRAMES = 8  # least number of frames of a turntable
 LARGEST_CROP = 2048  # pixels of a side of the picture of a known camera, cropped to the subject
 STILL = 0.004  # largest mean difference of a turntable's frames from its first, in [0, 1]: below, nothing turns
 OPEN_SHARE = 3.0  # difference of last and first frame, in largest steps between frames: above, the turn is not whole
@@ -42,7 +42,7 @@ ViewsByFrame = list[list[KnownView]]  # views by frame
 
 
 def run(job: Job) -> StepReport:
-    """Write the bank of known views, and a picture of them beside the hull that they share.
+    """Write the bank of known views, and a picture of them beside their visual hull.
 
     Raises:
         BadInput: a view is not of the subject, or a file cannot be used.
@@ -111,7 +111,7 @@ class _Reader:
             name = given.views[moving.index(True)].name
             raise BadInput(f"{name} is a video; --view takes pictures: give videos of other sides with --cameras")
         if all(moving):
-            return self._moving(given, sources)
+            return self._video_views(given, sources)
         if any(moving):
             raise BadInput("--cameras mixes pictures and videos; give only pictures or only videos")
         if given.input_camera is not None:
@@ -129,14 +129,14 @@ class _Reader:
         places = evenly_spaced(source.count, TURNTABLE_FRAMES)
         prepared = self._cut(source, TURNTABLE)
         notes, angles = prepared.notes, [360 * place / source.count for place in places]
-        views = self._turned(prepared.frames, angles)
+        views = self._turntable_sides(prepared.frames, angles)
         if given.views:
             (more,), other_notes = self.views(given)
             alone = [v for v in views if all(angle_deg(v.camera, own.camera) > CLOSE_DEG for own in more)]
             views, notes = [*alone, *more], (*notes, *other_notes)
         return [views], notes
 
-    def _moving(self, given: GivenViews, sources: Sequence[Source]) -> tuple[ViewsByFrame, tuple[str, ...]]:
+    def _video_views(self, given: GivenViews, sources: Sequence[Source]) -> tuple[ViewsByFrame, tuple[str, ...]]:
         """Return the views of synchronized videos by frame."""
         own = self._source()
         for view, source in zip(given.views, sources, strict=True):
@@ -199,29 +199,29 @@ class _Reader:
         heights = [match_scale(cut, self.inputs[0], view.azimuth) for view, cut in zip(given, cutouts, strict=True)]
         front = known_view(self.inputs[0], name=INPUT)
         as_given, matched = (
-            [known_view(cut, v.azimuth, v.elevation, v.name) for v, cut in zip(given, chosen, strict=True)]
-            for chosen in (cutouts, heights)
+            [known_view(cut, v.azimuth, v.elevation, v.name) for v, cut in zip(given, cuts, strict=True)]
+            for cuts in (cutouts, heights)
         )
         unchanged = agreement([front, *as_given]).mean
         if unchanged > GOOD or unchanged >= agreement([front, *matched]).mean:
             return as_given
         return matched
 
-    def _turned(self, cutouts: Float[Tensor, "t s s 4"], angles: Sequence[float]) -> list[KnownView]:
+    def _turntable_sides(self, cutouts: Float[Tensor, "t s s 4"], angles: Sequence[float]) -> list[KnownView]:
         """Return the views of a turntable without its front, in the direction that fits better."""
         scaling = scaling_between(cutouts[0], self.inputs[0])
         views = []
         for angle, cutout in list(zip(angles, cutouts, strict=True))[1:]:
             picture = cutout if scaling.is_small else scaling.apply(cutout, angle, self.inputs.shape[1])
             views.append(known_view(picture, angle, name=f"turntable at {angle:.0f} degrees"))
-        return turned(known_view(self.inputs[0], name=INPUT), views)
+        return orient_turntable(known_view(self.inputs[0], name=INPUT), views)
 
 
 def check_turn(source: Source) -> None:
     """Refuse a turntable that is a picture, too short, still, or not closed.
 
     Raises:
-        BadInput: says what it is.
+        BadInput: names the defect.
     """
     if source.kind != "video" or source.count < FEWEST_FRAMES:
         raise BadInput(
@@ -233,16 +233,16 @@ def check_turn(source: Source) -> None:
     steps = color.diff(dim=0).abs().mean((1, 2, 3))
     if float(from_first.max()) < STILL:
         raise BadInput(f"{TURNTABLE} shows no turn: its frames are alike; record the still subject, turned once")
-    gap = source.count - 1 - evenly_spaced(source.count, TURNTABLE_FRAMES)[-2]
-    if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / gap):
+    before, last = evenly_spaced(source.count, TURNTABLE_FRAMES)[-2:]
+    if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / (last - before)):
         raise BadInput(
             f"{TURNTABLE} is not a whole turn: its last frame is unlike its first; record one turn, and cut right "
             "before the first picture repeats"
         )
 
 
-def turned(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
-    """Return the views of a turntable, with the sign of their azimuths that fits the input better."""
+def orient_turntable(front: KnownView, views: Sequence[KnownView]) -> list[KnownView]:
+    """Return the views of a turntable, turning in the direction that fits the input better."""
     reverse = [view.at(view.camera.elevation_deg, -view.camera.azimuth_deg % 360) for view in views]
     return max(([*views], reverse), key=lambda ring: turntable_score([front, *ring]))
 
@@ -257,7 +257,9 @@ def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
     many = len(views) > FEW and found.odd is None
     share, least = (found.mean, LEAST_MEAN) if many else (lowest, LEAST_FILLED)
     if share < least:
-        named = f"{_place(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
+        named = (
+            f"{_describe_view(views[found.odd])} contradicts the others" if found.odd else "they contradict each other"
+        )
         filled = "of the silhouettes" if many else "of one silhouette"
         raise BadInput(
             f"the views do not show one subject from the given azimuths: {named}; their common visual hull fills only "
@@ -267,19 +269,21 @@ def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
     if found.odd is None:
         return ()
     return (
-        f"{_place(views[found.odd])} contradicts the other views: the common visual hull fills only {lowest:.0%} of "
-        "one silhouette; see the picture of the step prepare_views",
+        f"{_describe_view(views[found.odd])} contradicts the other views: the common visual hull fills only "
+        f"{lowest:.0%} of one silhouette; see the picture of the step prepare_views",
     )
 
 
 def exposure_notes(views: Sequence[KnownView], gains: Sequence[Float[Tensor, " 3"] | None]) -> tuple[str, ...]:
     """Return a note that names the views that get brighter or darker."""
     changed = [view for view, gain in zip(views, gains, strict=True) if gain is not None]
-    return (f"exposure adjusted to the input: {', '.join(_place(view) for view in changed)}",) if changed else ()
+    return (
+        (f"exposure adjusted to the input: {', '.join(_describe_view(view) for view in changed)}",) if changed else ()
+    )
 
 
 def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:
-    """Compose the pictures in a row, and under each the outline of the hull that all share."""
+    """Compose the pictures in a row, and under each the outline of their common visual hull."""
     small = [smaller(view) for view in views]
     shown = torch.cat([over_white(view.cutout) for view in small], 1)
     try:
@@ -292,7 +296,7 @@ def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:
     return torch.cat([shown, under])
 
 
-def _place(view: KnownView) -> str:
+def _describe_view(view: KnownView) -> str:
     azimuth, elevation = (round(angle, 1) + 0.0 for angle in (view.camera.azimuth_deg, view.camera.elevation_deg))
     return f"{view.name or 'a view'} (azimuth {azimuth:g}, elevation {elevation:g})"  # + 0.0: no -0
 

@@ -6,7 +6,7 @@ from operator import attrgetter
 from types import UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import AfterValidator, Field, ValidationError, create_model, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError, create_model, model_validator
 
 from dg4d_lib.asset_settings import AssetSettings, GateSettings, PackSettings, ScoreSettings
 from dg4d_lib.errors import BadInput, quoted
@@ -24,6 +24,7 @@ from dg4d_lib.settings import (
     DeformationSettings,
     GeometricPriorSettings,
     HexPlaneSettings,
+    ImageDreamPriorSettings,
     MeshSettings,
     MotionSettings,
     PriorSettings,
@@ -38,6 +39,7 @@ from steps.contract import StepSpec, alternatives, load_object, settings_errors
 
 LARGEST_WHOLE = 2**53  # largest integer that every JSON reader represents exactly
 ZERO123_VARIANTS = {"zero123-xl": "xl", "stable-zero123": "stable"}  # by name in the registry
+IMAGEDREAM_RING = 4  # views scored together, as RING in dg4d_lib/guidance/imagedream.py, which imports torch
 RENAMED_SETTINGS = {  # old name: new name, empty if the value is fixed now; removed with 1.0
     "text.steps": "text.num_inference_steps",
     "text.guidance": "text.guidance_scale",
@@ -129,6 +131,15 @@ class PipelineSettings(Settings):
                     raise ValueError(variant_refusal(owner, prior, ZERO123_VARIANTS[name]))
         return self
 
+    @model_validator(mode="after")
+    def _refuse_incomplete_rings(self) -> Self:
+        """Refuse numbers of views that form no rings for ImageDream."""
+        if isinstance(self.prior, ImageDreamPriorSettings):
+            for name, stage in (("static", self.static), ("motion", self.motion)):
+                if stage.iterations and stage.guidance_weight and stage.views % IMAGEDREAM_RING:
+                    raise ValueError(ring_refusal(name, stage.views))
+        return self
+
     @model_validator(mode="before")
     @classmethod
     def _refuse_old_names(cls, given: Any) -> Any:
@@ -155,6 +166,14 @@ def variant_refusal(owner: str, prior: Zero123PriorSettings, variant: str) -> st
     return (
         f"{owner}.variant = {prior.variant} does not fit {owner}.weights = {prior.weights}, which are of the variant "
         f"{variant}; set {owner}.variant={variant}"
+    )
+
+
+def ring_refusal(stage: str, views: int) -> str:
+    """Return the sentence that refuses a number of views with ImageDream as the prior."""
+    return (
+        f"{stage}.views = {views} does not fit prior.kind = imagedream, which scores {IMAGEDREAM_RING} views together; "
+        f"set {stage}.views to a multiple of {IMAGEDREAM_RING}, for example {stage}.views={IMAGEDREAM_RING}"
     )
 
 
@@ -186,6 +205,9 @@ class ScoreAssetSettings(Settings):
     rasterizer: Backend
     mesh: bool = Field(False, description="the textured mesh is scored instead of the splats")
     actionbench: bool = Field(False, description="also compare meshes by the metrics of ActionBench")
+    max_frames: int = Field(
+        0, ge=0, description="subject.max_frames of an asset that follows a video, which has such frames only; 0: all"
+    )
     score: ScoreSettings = ScoreSettings()
 
 
@@ -246,9 +268,9 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         for i, name in enumerate([*path, last]):
             if not isinstance(branch, dict) or name not in branch:
                 section, rest = key.split(".")[:i], key.split(".")[i:]
-                chosen = branch.get("kind") if isinstance(branch, dict) else None
-                if chosen and (kinds := _kinds_with(section, rest)):
-                    raise BadInput(_other_kind(key, ".".join(section), kinds, chosen))
+                selected = branch.get("kind") if isinstance(branch, dict) else None
+                if selected and (kinds := _kinds_with(section, rest)):
+                    raise BadInput(_other_kind(key, ".".join(section), kinds, selected))
                 known = ", ".join(sorted(branch)) if isinstance(branch, dict) else "nothing: it is a value"
                 raise BadInput(f"unknown setting {key!r}: {'.'.join(key.split('.')[:i]) or 'the pipeline'} has {known}")
             if i < len(path):
@@ -256,7 +278,8 @@ def revise(settings: PipelineSettings, changes: dict[str, Any]) -> PipelineSetti
         if last == "kind" and branch[last] != value:
             branch.clear()
         branch[last] = value
-        tree = _with_defaults(tree)
+        changed = key.split(".")[0]
+        tree[changed] = _with_defaults(changed, tree[changed])
     try:
         return PipelineSettings.model_validate(tree)
     except ValidationError as error:
@@ -290,9 +313,9 @@ def _classes_of(owner: type[Settings], name: str) -> list[type[Settings]]:
     return [one for one in choices if isinstance(one, type) and issubclass(one, Settings)]
 
 
-def _other_kind(key: str, section: str, kinds: list[str], chosen: str) -> str:
+def _other_kind(key: str, section: str, kinds: list[str], selected: str) -> str:
     return (
-        f"{key} exists with {section}.kind={alternatives(kinds)}; {section}.kind is {chosen}. "
+        f"{key} exists with {section}.kind={alternatives(kinds)}; {section}.kind is {selected}. "
         f"Add `--set {section}.kind={kinds[0]}`."
     )
 
@@ -301,12 +324,20 @@ def _renamed(old: str, new: str) -> str:
     return f"the setting {old} is now {new}" if new else f"the setting {old} is gone: its value is fixed"
 
 
-def _with_defaults(tree: dict[str, Any]) -> dict[str, Any]:
-    """Add the defaults of a changed `kind`; return a tree that is not valid yet unchanged."""
+def _with_defaults(section: str, value: Any) -> Any:
+    """Return a section with the defaults of a changed `kind`; one that is not valid yet, or no section, unchanged."""
+    if not isinstance(value, dict):
+        return value
+    adapter = _adapter(section)
     try:
-        return PipelineSettings.model_validate(tree).model_dump(mode="json")
+        return adapter.dump_python(adapter.validate_python(value), mode="json")
     except ValidationError:
-        return tree
+        return value
+
+
+@functools.cache
+def _adapter(section: str) -> TypeAdapter[Any]:
+    return TypeAdapter(_annotation(section))
 
 
 PUBLIC_BOX = 1.6  # half side of the planes' box in the public code, over which the paper chose a resolution of 32
@@ -360,6 +391,15 @@ PAPER = revise(
         "refiner.kind": "video_to_video",
     },
 )
+PAPER_LGM = revise(
+    PAPER,
+    {
+        "static.start.kind": "lgm",
+        "static.iterations": 0,
+        "deformation.half_side": LGM_SCALE * PUBLIC_BOX,
+        "motion.length_scale": LGM_SCALE,
+    },
+)
 VIDEO = revise(PAPER, {"subject.max_frames": 32, "motion.iterations": 500})
 VIDEO_FAST = revise(VIDEO, {"subject.max_frames": 16, "motion.views": 1})
 
@@ -380,22 +420,18 @@ RELEASE = revise(
 )
 
 REFERENCE = revise(
-    PAPER,
+    PAPER_LGM,
     {
         "prior.weights": "stable-zero123",
         "prior.variant": "stable",
-        "static.start.kind": "lgm",
-        "static.iterations": 0,
         "static.t_max_start": 1.0,
         "static.t_max_end": 0.0,
         "deformation.temporal": 12,
-        "deformation.half_side": LGM_SCALE * PUBLIC_BOX,
         "deformation.endpoint": False,
         "motion.iterations": 500,
         "motion.t_max_start": 1.0,
         "motion.t_max_end": 0.0,
         "motion.fine_tune": True,
-        "motion.length_scale": LGM_SCALE,
     },
 )
 
@@ -428,10 +464,11 @@ OPEN = revise(
     },
 )
 
-ProfileName = Literal["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"]
+ProfileName = Literal["preview", "paper", "paper-lgm", "video", "video-fast", "release", "reference", "quality", "open"]
 PROFILES: dict[str, PipelineSettings] = {
     "preview": PREVIEW,
     "paper": PAPER,
+    "paper-lgm": PAPER_LGM,
     "video": VIDEO,
     "video-fast": VIDEO_FAST,
     "release": RELEASE,

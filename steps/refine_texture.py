@@ -12,12 +12,13 @@ from dg4d_lib.diffusion.video_model import VideoModel
 from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.zero123 import Zero123
+from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.refiner_settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.texture.refine import MeshClip, RefinedTextures, refine_textures
 from dg4d_lib.texture.refiner import ImageToImage, Refiner, VideoToVideo, noise_levels
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts.media import read_frames
+from steps.artifacts.media import read_frames, read_png
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.fitting.priors import open_zero123
 from steps.runtime.job import Job, StepReport
@@ -27,6 +28,7 @@ from steps.runtime.weights import open_weights
 def run(job: Job) -> StepReport:
     """Refine the texture of the tracked mesh, or of every frame's mesh; the refiner sees all frames as one video.
 
+    Video diffusion is conditioned on the subject, the input picture; image diffusion on the frame of the driving video.
     A flow skips this step if `refiner.kind` is `identity`.
 
     Raises:
@@ -64,7 +66,8 @@ def _refine(job: Job, clips: Sequence[MeshClip]) -> tuple[list[RefinedTextures],
         case VideoToVideoSettings():
             opened = open_weights(kind.model.weights)
             model = VideoModel.load(opened.folder, kind.model, device)
-            refiner, run_notes = VideoToVideo(kind, model, pictures[0]), model.notes
+            picture = over_white(read_png(job.inputs["subject"])).to(device)
+            refiner, run_notes = VideoToVideo(kind, model, picture), model.notes
             method = f"by video diffusion {_range(noise_levels(kind, 0.0))}"
             if kind.strength_end:
                 method += f" (in the last iteration {_range(noise_levels(kind, 1.0))})"

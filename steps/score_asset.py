@@ -34,12 +34,13 @@ from steps.artifacts.surface_scores import actionbench_scores, chamfer_scores, r
 from steps.profiles import ScoreAssetSettings
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
+from steps.sources.clips import evenly_spaced
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, StillPicture, read_still
 
 FOREGROUND = 0.5  # alpha from which a pixel belongs to the subject
 NEARLY_WHITE = 0.98  # in opaque pictures, the subject has a channel below this
-FILM_SIZE, FILM_FPS = 256, 12.0  # largest side in pixels, and frame rate, of the videos
+VIDEO_SIZE, VIDEO_FPS = 256, 12.0  # largest side in pixels, and frame rate, of the videos
 DIGITS = 6  # decimals of every number
 
 Metrics = dict[str, float]
@@ -63,8 +64,8 @@ class ViewFrames:
 
     def pick(self, frames: Sequence[int]) -> "ViewFrames":
         """Return the frames of these indices."""
-        chosen = torch.tensor(frames)
-        return ViewFrames(self.color[chosen], self.alpha[chosen])
+        selected = torch.tensor(frames)
+        return ViewFrames(self.color[selected], self.alpha[selected])
 
 
 class MetricNetworks:
@@ -120,16 +121,16 @@ def run(job: Job) -> StepReport:
     settings: ScoreAssetSettings = job.settings
     with TemporaryDirectory() as folder:
         scratch = Path(folder)
-        truth = find_ground_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
+        ground_truth = find_ground_truth(_unpacked(job.inputs["truth"], scratch / "truth"))
         networks = MetricNetworks(settings.score)
         if "package" in job.inputs:
-            report, films = _score_package(job, truth, networks, scratch)
+            report, videos = _score_package(job, ground_truth, networks, scratch)
         else:
-            report, films = _score_baselines(job, truth, networks)
+            report, videos = _score_baselines(job, ground_truth, networks)
         if networks.i3d is not None and report["frames"] < MIN_FRAMES:
             shortage = f"I3D needs videos of {MIN_FRAMES} frames or more; these have {report['frames']}"
             networks.missing["fvd_consistent4d"] = shortage
-        _write_films(job.outputs["films"], films, scratch)
+        _write_videos(job.outputs["films"], videos, scratch)
     text = json.dumps({**report, "missing": networks.missing}, allow_nan=False)
     rounded = json.loads(text, parse_float=lambda digits: round(float(digits), DIGITS))
     job.outputs["scores"].write_text(json.dumps(rounded))
@@ -161,70 +162,81 @@ def compare(ours: ViewFrames, theirs: ViewFrames, networks: MetricNetworks) -> M
 
 
 def _score_package(
-    job: Job, truth: GroundTruth, networks: MetricNetworks, scratch: Path
+    job: Job, ground_truth: GroundTruth, networks: MetricNetworks, scratch: Path
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
     settings: ScoreAssetSettings = job.settings
     package = _unpacked(job.inputs["package"], scratch / "package")
-    given = _read(truth.inputs)
-    size, total = given.color.shape[1], len(truth.views) + 2
+    given = _read(ground_truth.inputs)
+    size, total = given.color.shape[1], len(ground_truth.views) + 2
+    last = None  # frame of the input that the last frame of the fit shows; None is the last one
+    if settings.max_frames and len(given) > 1:
+        last = evenly_spaced(len(given), settings.max_frames)[-1]
 
     def render(azimuth_deg: float, frames: int | None) -> ViewFrames:
         (view,), _ = render_package(
-            package, (azimuth_deg,), 0.0, size, frames, settings.mesh, scratch / "ours", rasterizer=settings.rasterizer
+            package,
+            (azimuth_deg,),
+            0.0,
+            size,
+            frames,
+            settings.mesh,
+            scratch / "ours",
+            rasterizer=settings.rasterizer,
+            last=last,
         )
         rendered = _read(sorted(view.iterdir()))
         shutil.rmtree(view)
         return rendered
 
     ours = render(0.0, len(given) if len(given) > 1 else None)
-    films, clips, views = {"input": ours}, {}, {}
+    videos, clips, views = {"input": ours}, {}, {}
     of_input = compare(ours.pick(range(len(given))), given, networks)
     if networks.clip is not None:
         embedded = networks.clip.embed(resize_square(ours.color, networks.size))
         wanted = networks.clip.embed(resize_square(given.color[:1], networks.size))
         of_input["clip_i"] = float(cosine_similarity(embedded, wanted.expand_as(embedded)).mean())
     job.progress(1, total, {})
-    for done, view in enumerate(truth.views, 2):
+    for done, view in enumerate(ground_truth.views, 2):
         theirs = _read(view.frames, size)
-        films[f"view_{view.name}"] = rendered = render(view.azimuth_deg, len(theirs))
+        videos[f"view_{view.name}"] = rendered = render(view.azimuth_deg, len(theirs))
         views[view.name] = compare(rendered, theirs, networks)
         clips[view.name] = networks.i3d_logits(rendered)
         job.progress(done, total, {})
     scores: Scores = {"input": of_input, "views": views, "mean": _mean(views)}
-    if truth.mesh is not None:
-        scores["geometry"] = _geometry(package, truth.mesh, settings, job.seed, networks)
+    if ground_truth.mesh is not None:
+        scores["geometry"] = _geometry(package, ground_truth.mesh, settings, job.seed, networks, last)
     job.progress(total, total, {})
-    return _report(truth, size, {"asset": scores}, clips), films
+    return _report(ground_truth, size, {"asset": scores}, clips), videos
 
 
 def _score_baselines(
-    job: Job, truth: GroundTruth, networks: MetricNetworks
+    job: Job, ground_truth: GroundTruth, networks: MetricNetworks
 ) -> tuple[dict[str, Any], dict[str, ViewFrames]]:
     """Score three baselines per view: the input's frames, its first frame, and the first frame of the true view."""
-    given = _read(truth.inputs)
+    given = _read(ground_truth.inputs)
     size = given.color.shape[1]
-    films, clips = {"input": given}, {}
+    videos, clips = {"input": given}, {}
     baselines: dict[str, dict[str, Metrics]] = {}
-    for done, view in enumerate(truth.views, 1):
+    for done, view in enumerate(ground_truth.views, 1):
         theirs = _read(view.frames, size)
-        films[f"view_{view.name}"] = theirs
+        videos[f"view_{view.name}"] = theirs
         still = [0] * len(theirs)
         tried = {"input_repeated": given} if len(given) == len(theirs) else {}
         tried |= {"input_frozen": given.pick(still), "truth_frozen": theirs.pick(still)}
         for name, frames in tried.items():
             baselines.setdefault(name, {})[view.name] = compare(frames, theirs, networks)
         clips[view.name] = networks.i3d_logits(theirs)
-        job.progress(done, len(truth.views), {})
+        job.progress(done, len(ground_truth.views), {})
     rows = {name: {"views": views, "mean": _mean(views)} for name, views in baselines.items()}
-    return _report(truth, size, rows, clips), films
+    return _report(ground_truth, size, rows, clips), videos
 
 
 def _report(
-    truth: GroundTruth, size: int, rows: Mapping[str, Scores], clips: Mapping[str, Tensor | None]
+    ground_truth: GroundTruth, size: int, rows: Mapping[str, Scores], clips: Mapping[str, Tensor | None]
 ) -> dict[str, Any]:
     """Return the `scores` artifact; `clips` are I3D's logits by view."""
-    frames = len(truth.views[0].frames) if truth.views else len(truth.inputs)
-    first = (truth.inputs[0], *(view.frames[0] for view in truth.views))
+    frames = len(ground_truth.views[0].frames) if ground_truth.views else len(ground_truth.inputs)
+    first = (ground_truth.inputs[0], *(view.frames[0] for view in ground_truth.views))
     opaque = [path.parent.name for path in first if not _decode(path).has_alpha]
     notes = (
         [f"ground-truth masks are estimated, because these pictures are opaque: {', '.join(opaque)}"] if opaque else []
@@ -238,12 +250,14 @@ def _mean(views: Mapping[str, Metrics]) -> Metrics:
     return {name: fmean(metrics[name] for metrics in views.values()) for name in names}
 
 
-def _geometry(package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int, networks: MetricNetworks) -> Metrics:
+def _geometry(
+    package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int, networks: MetricNetworks, last: int | None
+) -> Metrics:
     """Return chamfer distances to the true mesh, and ActionBench's if they are wanted."""
     meshes, score = read_true_meshes(mesh), settings.score
-    metrics = chamfer_scores(package, meshes, score.samples, seed)
+    metrics = chamfer_scores(package, meshes, score.samples, seed, last)
     if settings.actionbench:
-        found, reason = actionbench_scores(package, meshes, score.actionbench_points, score.icp_points, seed)
+        found, reason = actionbench_scores(package, meshes, score.actionbench_points, score.icp_points, seed, last)
         metrics |= found
         if reason:
             networks.missing["cd_m"] = reason
@@ -264,7 +278,7 @@ def _read(frames: Sequence[Path], size: int | None = None) -> ViewFrames:
 
 
 def _decode(path: Path) -> StillPicture:
-    """Decode a frame as pictures that assets are made from, upright, but never shrunk."""
+    """Decode a frame like an input picture, upright, but at full size."""
     return read_still(path, f"{path.parent.name}/{path.name}", DecodeLimit(math.inf), MOST_PIXELS)
 
 
@@ -276,13 +290,13 @@ def _cutout(picture: StillPicture) -> Float[Tensor, "h w 4"]:
     return torch.cat([color, (color.amin(-1, keepdim=True) < NEARLY_WHITE).to(color)], -1)
 
 
-def _write_films(path: Path, films: Mapping[str, ViewFrames], scratch: Path) -> None:
+def _write_videos(path: Path, videos: Mapping[str, ViewFrames], scratch: Path) -> None:
     entries = []
-    for name, film in films.items():
-        size = min(FILM_SIZE, film.color.shape[1]) // 2 * 2
-        small = F.interpolate(film.color.movedim(-1, 1), (size, size), mode="area").movedim(1, -1)
-        write_mp4(scratch / "film.mp4", small.contiguous(), FILM_FPS)
-        entries.append((f"{name}.mp4", (scratch / "film.mp4").read_bytes()))
+    for name, video in videos.items():
+        size = min(VIDEO_SIZE, video.color.shape[1]) // 2 * 2
+        small = F.interpolate(video.color.movedim(-1, 1), (size, size), mode="area").movedim(1, -1)
+        write_mp4(scratch / "video.mp4", small.contiguous(), VIDEO_FPS)
+        entries.append((f"{name}.mp4", (scratch / "video.mp4").read_bytes()))
     write_zip(path, entries)
 
 

@@ -87,7 +87,8 @@ def fit_gaussians(
     """Fit a cloud to one image, with a guidance prior for unseen views.
 
     Args:
-        start: the cloud at iteration 0; the fit runs on its device.
+        start: the cloud at iteration 0, of which the most opaque `settings.max_points` are fitted; the fit runs on its
+            device.
         subject: the cut-out, straight alpha, seen at azimuth and elevation 0.
         prior: scores random views.
         rasterize: rasterizer.
@@ -114,6 +115,7 @@ def fit_gaussians(
         ]
 
     rates = learning_rates(settings)
+    start = most_opaque(start, settings.max_points, generator)
     cloud = _Cloud.of(start, rates)
     grad2d = Grad2dStats.zeros(len(start), device)
     for step in range(1, settings.iterations + 1):
@@ -169,6 +171,15 @@ def fit_gaussians(
     return cloud.gaussians.detach()
 
 
+def most_opaque(gaussians: Gaussians, count: int, generator: torch.Generator) -> Gaussians:
+    """Return at most `count` Gaussians, the most opaque; among equal ones a random choice, as they may lie in order."""
+    if len(gaussians) <= count:
+        return gaussians
+    shuffled = torch.randperm(len(gaussians), generator=generator).to(gaussians.means.device)
+    order = gaussians.opacity_logits.detach()[shuffled].argsort(descending=True, stable=True)
+    return gaussians.subset(shuffled[order[:count]].sort().values)
+
+
 def draw_view(known: Sequence[KnownView], generator: torch.Generator) -> int:
     """Draw one of the views: uniformly, or in proportion to their weights where these differ."""
     weights = torch.tensor([view.weight for view in known])
@@ -181,7 +192,7 @@ def adapt_density(
     cloud: _Cloud, grad2d: Grad2dStats, step: int, settings: StaticSettings, generator: torch.Generator
 ) -> bool:
     """Densify and prune if it is time to, and only prune after the last iteration; return whether the cloud changed."""
-    if step == settings.iterations >= settings.densify_every:  # new Gaussians would stay as they were copied
+    if step == settings.iterations >= settings.densify_every:  # new Gaussians would not be optimized any more
         cloud.replace(prune(cloud.gaussians, settings.prune_opacity, LAST_PRUNE * settings.prune_scale))
         return True
     if step < settings.iterations and step % settings.densify_every == 0:
@@ -237,7 +248,7 @@ def require_near(gaussians: Gaussians) -> None:
     """Refuse a cloud with means far away, from which later stages would diverge.
 
     Raises:
-        Diverged: says what to lower.
+        Diverged: names the settings to lower.
     """
     farthest = float(gaussians.means.detach().abs().max())
     if not farthest <= FARTHEST:
@@ -258,7 +269,7 @@ def require_enough(cloud: _Cloud, step: int, settings: StaticSettings, before: G
         before: the cloud before this iteration.
 
     Raises:
-        Diverged: says how to keep more.
+        Diverged: names the settings that keep more.
     """
     if len(cloud.gaussians) < MIN_GAUSSIANS:
         raise Diverged(

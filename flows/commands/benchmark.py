@@ -24,7 +24,7 @@ from flows.packages.summary import BatchProgress, Row
 from flows.step_errors import StepError, StepMissing
 from steps.artifacts.archives import unpack
 from steps.artifacts.ground_truth import MESH, GroundTruth, find_ground_truth, find_ground_truths
-from steps.catalog import PACKAGE, TRUTH
+from steps.catalog import GROUND_TRUTH, PACKAGE
 from steps.contract import ArtifactRef
 from steps.profiles import ScoreAssetSettings, profile, revise
 from steps.runtime.weights import without_paths
@@ -39,12 +39,14 @@ if TYPE_CHECKING:
 
 NEEDED = ("asset.json", "asset.glb", "splats/", "meshes/", "canonical/")  # files of a package for rendering
 SCORE = "score."  # prefix of the settings of scores
-ASSETS, FILMS = "assets", "films"  # folders of a benchmark
+UNSCORED = frozenset(["pack_asset", "check_asset"])  # steps whose time counts for no score
+MESH_STEPS = frozenset(["plan_mesh", "extract_mesh", "join_meshes", "refine_texture"])  # not needed by the splats
+ASSETS, VIDEOS = "assets", "films"  # folders of a benchmark
 
 
 def score(
     package: Path,
-    truth: Path,
+    ground_truth: Path,
     console: "Console",
     mesh: bool = False,
     changes: list[str] | None = None,
@@ -55,7 +57,7 @@ def score(
 
     Args:
         package: folder of the asset.
-        truth: folder in a layout of steps/artifacts/ground_truth.py, or a picture if other views are unknown.
+        ground_truth: folder in a layout of steps/artifacts/ground_truth.py, or a picture if other views are unknown.
         console: for progress.
         mesh: score the textured mesh instead of the splats.
         changes: "score.NAME=VALUE", settings of `ScoreSettings`.
@@ -66,13 +68,13 @@ def score(
         BadInput: the asset, the ground truth or a setting cannot be used, or `out` cannot be written.
         StepError: the step failed.
     """
-    if not truth.exists():
-        raise BadInput(f"--truth: {truth} does not exist; give a folder of an object, or a picture")
-    found, (pipeline, settings) = find_ground_truth(truth), _settings(changes, mesh)
+    if not ground_truth.exists():
+        raise BadInput(f"--truth: {ground_truth} does not exist; give a folder of an object, or a picture")
+    found, (pipeline, settings) = find_ground_truth(ground_truth), _settings(changes, mesh)
     if pipeline:
         raise BadInput(f"only settings that begin with {SCORE!r} apply to a finished asset; given {min(pipeline)}")
     if actionbench and found.mesh is None:
-        raise BadInput(f"{truth} has no {MESH}; --actionbench compares with true meshes (vertices, faces)")
+        raise BadInput(f"{ground_truth} has no {MESH}; --actionbench compares with true meshes (vertices, faces)")
     settings = settings.model_copy(update={"actionbench": actionbench})
     record = load_verified(package)
     if out is not None:
@@ -86,16 +88,17 @@ def score(
     with running(home.store(), str(package)), terminal.steps_shown(console), flow_context():
         entry = BenchmarkEntry(
             name=found.name,
-            truth=put_truth(found, home.store()),
+            ground_truth=put_ground_truth(found, home.store()),
             package=put_package(package, record, home.store()),
-            seconds=_seconds(record),
+            seconds=compute_seconds(record, mesh),
+            max_frames=frame_limit(record),
         )
         judged = score_assets(
             [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
         )
     for one in judged.results.failed:
         if EXIT_STATUS.get(one.kind) == EXIT_BAD_INPUT:
-            raise BadInput(f"{package} cannot be scored against {truth}: {one.error}")
+            raise BadInput(f"{package} cannot be scored against {ground_truth}: {one.error}")
         raise (StepMissing if EXIT_STATUS.get(one.kind) == EXIT_MISSING else StepError)("score_asset", one.error)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -138,21 +141,27 @@ def bench(
         BadInput: the data set or a setting cannot be used, or `out` cannot be written.
         BackendUnavailable: something that the profile needs is missing.
     """
-    truths = find_ground_truths(dataset)[:limit]
-    for truth in truths:
+    ground_truths = find_ground_truths(dataset)[:limit]
+    for ground_truth in ground_truths:
         if allow:
-            allow(truth.files)
-        check_truth(truth)
+            allow(ground_truth.files)
+        check_ground_truth(ground_truth)
     given, settings = _settings(changes, mesh)
     if bank:
         given = {"prior.kind": "oracle", **given}
-        if without := [truth.name for truth in truths if truth.bank is None]:
+        if without := [one.name for one in ground_truths if one.bank is None]:
             raise BadInput(f"--bank needs ground-truth views, which these objects lack: {', '.join(without)}")
     pipeline = revise(profile(profile_name), given)
+    most = pipeline.subject.max_frames
+    if bank and (longer := [one.name for one in ground_truths if len(one.inputs) > most]):
+        raise BadInput(
+            f"--bank: views belong to frames of the whole video, and of these videos only {most} frames would be used "
+            f"(subject.max_frames): {', '.join(longer)}; set subject.max_frames to their number of frames"
+        )
     settings = settings.model_copy(update={"rasterizer": pipeline.rasterizer})
     settings = ScoreAssetSettings.model_validate(settings.model_dump(mode="json"))
     check_writable(out)
-    requests = [_request(truth, bank, profile=profile_name, settings=pipeline, seed=seed) for truth in truths]
+    requests = [request_of(one, bank, given, profile_name, seed) for one in ground_truths]
     for request in requests:
         request.check()
         check_folder(out / ASSETS / request.item)
@@ -165,9 +174,9 @@ def bench(
     with running(home.store(), str(out)):
         jobs = [request.to_job(home.store()) for request in requests]
         rows = _converted(jobs, out / ASSETS, workers, console, dataset.name)
-        entries = [_entry(truth, out / ASSETS / truth.name, rows[truth.name]) for truth in truths]
+        entries = [_entry(one, out / ASSETS / one.name, rows[one.name], mesh) for one in ground_truths]
         title = f"{dataset.absolute().name}, {profile_name}{', ground-truth views as prior' if bank else ''}"
-        with terminal.batch_shown(console, [truth.name for truth in truths]) as table, flow_context():
+        with terminal.batch_shown(console, [one.name for one in ground_truths]) as table, flow_context():
             judged = score_assets(entries, settings, title, profile_name, seed)
             for one in judged.results.objects:
                 table.settle(one.object, "failed" if one.error else "done", one.error)
@@ -177,44 +186,45 @@ def bench(
 
 
 def write(results: Results, judged: "BenchmarkResult", out: Path) -> None:
-    """Write the files of a benchmark; raises DiskFull."""
-    films = _unpack_films(judged, out)
+    """Write the files of a benchmark into a folder, created if necessary; raises DiskFull."""
+    out.mkdir(parents=True, exist_ok=True)
+    videos = _unpack_videos(judged, out)
     texts = {
         "results.json": _json(results),
         "results.csv": scores.csv_text(results),
         "table.md": scores.markdown(results),
-        "index.html": scores.scores_page(results, films),
+        "index.html": scores.scores_page(results, videos),
     }
     for name, text in texts.items():
         write_atomically(out / name, text)
 
 
-def check_truth(truth: GroundTruth) -> None:
+def check_ground_truth(ground_truth: GroundTruth) -> None:
     """Refuse ground truth with invalid pictures or an invalid mesh archive.
 
     Raises:
         BadInput: names the file.
     """
-    for path in truth.pictures:
+    for path in ground_truth.pictures:
         check_still(path)
-    if truth.mesh is not None:
-        check_arrays(truth.mesh)
+    if ground_truth.mesh is not None:
+        check_arrays(ground_truth.mesh)
 
 
-def put_truth(truth: GroundTruth, store: ArtifactStore) -> ArtifactRef:
+def put_ground_truth(ground_truth: GroundTruth, store: ArtifactStore) -> ArtifactRef:
     """Store ground truth in our own layout; equal pictures give equal bytes, whatever their layout was.
 
     Raises:
         BadInput: a file is not a picture, or the mesh is not a NumPy archive.
         DiskFull: the disk is full.
     """
-    check_truth(truth)
-    files = {f"input/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(truth.inputs)}
-    for view in truth.views:
+    check_ground_truth(ground_truth)
+    files = {f"input/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(ground_truth.inputs)}
+    for view in ground_truth.views:
         files |= {f"view_{view.name}/{i:03d}{path.suffix.lower()}": path for i, path in enumerate(view.frames)}
-    if truth.mesh is not None:
-        files["mesh.npz"] = truth.mesh
-    return put_zip(files, TRUTH.media_type, store)
+    if ground_truth.mesh is not None:
+        files["mesh.npz"] = ground_truth.mesh
+    return put_zip(files, GROUND_TRUTH.media_type, store)
 
 
 def put_package(folder: Path, record: Mapping[str, Any], store: ArtifactStore) -> ArtifactRef:
@@ -237,15 +247,24 @@ def _settings(changes: list[str] | None, mesh: bool) -> tuple[dict[str, Any], Sc
     return {key: value for key, value in given.items() if not key.startswith(SCORE)}, settings
 
 
-def _request(truth: GroundTruth, bank: bool, **asked: Any) -> ConversionRequest:
-    """Return the request of `dg4d make`: follow the input video, or animate the input picture."""
-    folder = truth.inputs[0].parent
+def request_of(
+    ground_truth: GroundTruth, bank: bool, given: dict[str, Any], profile_name: str, seed: int
+) -> ConversionRequest:
+    """Return the request of `dg4d make`: follow the input video, or animate the input picture.
+
+    The cameras of a video and of views are known, so their frames are used uncropped unless `given` says otherwise.
+    """
+    folder = ground_truth.inputs[0].parent
+    is_placed = bool(ground_truth.views) or len(ground_truth.inputs) > 1
+    changes = {"subject.framing": "keep", **given} if is_placed else given
     return ConversionRequest(
-        item=truth.name,
-        picture=truth.inputs[0],
-        video=folder if len(truth.inputs) > 1 else None,
-        bank=truth.bank if bank else None,
-        **asked,
+        item=ground_truth.name,
+        picture=ground_truth.inputs[0],
+        video=folder if len(ground_truth.inputs) > 1 else None,
+        bank=ground_truth.bank if bank else None,
+        profile=profile_name,
+        settings=revise(profile(profile_name), changes),
+        seed=seed,
     )
 
 
@@ -263,39 +282,56 @@ def _converted(jobs: list[ConversionJob], folder: Path, workers: int, console: "
     return rows | progress.rows
 
 
-def _entry(truth: GroundTruth, folder: Path, row: Row) -> "BenchmarkEntry":
+def _entry(ground_truth: GroundTruth, folder: Path, row: Row, mesh: bool) -> "BenchmarkEntry":
     from flows.benchmark import BenchmarkEntry
 
-    ref = put_truth(truth, home.store())
+    ref = put_ground_truth(ground_truth, home.store())
     if row.status == "failed":
-        return BenchmarkEntry(name=truth.name, truth=ref, error=row.message, kind=row.kind)
+        return BenchmarkEntry(name=ground_truth.name, ground_truth=ref, error=row.message, kind=row.kind)
     try:
         record = load_verified(folder)
         package = put_package(folder, record, home.store())
     except DG4DError as error:
-        return BenchmarkEntry(name=truth.name, truth=ref, error=str(error), kind=type(error).__name__)
-    return BenchmarkEntry(name=truth.name, truth=ref, package=package, seconds=_seconds(record))
+        return BenchmarkEntry(name=ground_truth.name, ground_truth=ref, error=str(error), kind=type(error).__name__)
+    return BenchmarkEntry(
+        name=ground_truth.name,
+        ground_truth=ref,
+        package=package,
+        seconds=compute_seconds(record, mesh),
+        max_frames=frame_limit(record),
+    )
 
 
-def _seconds(record: Mapping[str, Any]) -> float:
-    """Return the compute time of a package's steps, including cached ones."""
-    steps = record.get("run", {}).get("steps", [])
+def compute_seconds(record: Mapping[str, Any], mesh: bool) -> float:
+    """Return the compute time of what is scored, including cached steps.
+
+    For splats these are the steps up to the motion fit, as in the paper's times; for meshes also extraction and
+    refinement.
+    """
+    without = UNSCORED if mesh else UNSCORED | MESH_STEPS
+    steps = [step for step in record.get("run", {}).get("steps", []) if step["step"].split()[0] not in without]
     return round(sum(float(step.get("duration_s", 0.0)) for step in steps), 1)
+
+
+def frame_limit(record: Mapping[str, Any]) -> int:
+    """Return the number of frames that the video of a package was sampled to, at most; 0 if it follows no video."""
+    follows = any("footage" in step["outputs"] for step in record.get("steps", []))
+    return int(record["recipe"]["settings"]["subject"]["max_frames"]) if follows else 0
 
 
 def _json(results: Results) -> str:
     return json.dumps(results.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
-def _unpack_films(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, dict[str, str]]]:
+def _unpack_videos(judged: "BenchmarkResult", out: Path) -> dict[str, dict[str, dict[str, str]]]:
     """Unpack every video below OUT; return their paths by object, source and view."""
     shown: dict[str, dict[str, dict[str, str]]] = {}
-    for name, refs in judged.films.items():
+    for name, refs in judged.videos.items():
         for whose, ref in refs.items():
-            folder = out / FILMS / name / whose
+            folder = out / VIDEOS / name / whose
             folder.mkdir(parents=True, exist_ok=True)
             with room_for(folder):
-                films = unpack(home.store().path(ref), folder, "the zip of videos")
-            views = {Path(film).stem: f"{FILMS}/{name}/{whose}/{film}" for film in films}
+                videos = unpack(home.store().path(ref), folder, "the zip of videos")
+            views = {Path(video).stem: f"{VIDEOS}/{name}/{whose}/{video}" for video in videos}
             shown.setdefault(name, {})[whose] = views
     return shown

@@ -17,6 +17,7 @@ def finite(value: float | None) -> float | None:
 PROFILES = (
     "preview",
     "paper",
+    "paper-lgm",
     "video",
     "video-fast",
     "release",

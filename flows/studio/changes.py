@@ -1,4 +1,4 @@
-"""Changes that the studio page asks for: uploads, cut-outs, conversions, cancel, retry, again."""
+"""Requests of the studio page that change something: uploads, cut-outs, conversions, cancel, retry, repetition."""
 
 from typing import Any, TypeVar
 
@@ -15,7 +15,7 @@ from flows.studio import gallery, quick
 from flows.studio.drafts import MOST_MASK_BYTES, Draft, TooLarge
 from flows.studio.pages import HEADERS
 from flows.studio.server_api import ENDED, ServerApi
-from flows.studio.submission import RunRequest, Submission, again, convert, retry
+from flows.studio.submission import RunRequest, Submission, convert, repetition, retry
 from steps.contract import LARGEST_SEED, Frozen
 
 T = TypeVar("T", bound=BaseModel)
@@ -100,10 +100,10 @@ class Changes:
         return _json((await run_in_threadpool(cut)).model_dump(mode="json"))
 
     async def motions(self, request: Request) -> Response:
-        """Make films of the motions of a draft."""
+        """Generate preview videos of the motions of a draft."""
         draft, region = Draft(request.path_params["identifier"]), await _parsed(request, Region)
-        found = await run_in_threadpool(lambda: quick.films(draft, region.profile, region.box, region.masked))
-        return _json({"films": [film.model_dump() for film in found]})
+        found = await run_in_threadpool(lambda: quick.motion_previews(draft, region.profile, region.box, region.masked))
+        return _json({"films": [preview.model_dump() for preview in found]})
 
     async def convert(self, request: Request) -> Response:
         """Start the conversion of a draft."""
@@ -111,18 +111,18 @@ class Changes:
         return await self._start(await run_in_threadpool(lambda: convert(draft, wanted)))
 
     async def cancel(self, request: Request) -> Response:
-        """Ask for the end of a conversion."""
+        """Cancel a conversion."""
         await self._api.cancel(await self._api.run(request.path_params["identifier"]))
         return _json({})
 
     async def retry(self, request: Request) -> Response:
-        """Start a conversion that did not succeed once more."""
+        """Restart a conversion that did not succeed."""
         run = await self._api.run(request.path_params["identifier"])
         if run["state_type"] not in ENDED:
             raise HTTPException(409, "this conversion has not ended; cancel it first")
         return await self._start(retry(run))
 
-    async def again(self, request: Request) -> Response:
+    async def repeat(self, request: Request) -> Response:
         """Start the conversion of an asset with changed settings."""
         key, wanted = request.path_params["key"], await _parsed(request, Repetition)
         found = await run_in_threadpool(lambda: gallery.find(home.store(), key))
@@ -135,7 +135,7 @@ class Changes:
             raise BadInput(
                 "this version was not made in the studio; repeat it with `dg4d make` and the settings in its report"
             )
-        return await self._start(again(run, wanted.settings, wanted.seed))
+        return await self._start(repetition(run, wanted.settings, wanted.seed))
 
     async def _start(self, wanted: RunRequest) -> Response:
         identifier = await self._api.start(*wanted)

@@ -24,10 +24,11 @@ from PIL import Image
 from dg4d_lib.errors import BadInput
 from flows import home
 from flows.engine.free_space import require_free_space
-from flows.inputs.models import FORMATS, check_model
+from flows.inputs.models import check_model
 from flows.inputs.naming import LONGEST_PART_BYTES, clean_name
 from flows.inputs.sources import LARGEST_FILE_BYTES
 from steps.sources.media_types import (
+    MODEL_SUFFIXES,
     SNIFFED_BYTES,
     check_media,
     is_animated_png,
@@ -48,7 +49,7 @@ IDENTIFIER = re.compile(r"[0-9a-f]{16}")
 
 
 class TooLarge(BadInput):
-    """File with more bytes than are taken."""
+    """File that exceeds the limit on bytes."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Upload:
 
     Attributes:
         path: of the file.
-        kind: what it is, by its content.
+        kind: of the file, recognized by its content.
     """
 
     path: Path
@@ -139,7 +140,7 @@ class Draft:
         """Write a stream to a file and keep it if it is a picture, a video, a zip of frames or a model.
 
         Args:
-            name: as the browser says; only its last part counts, cleaned.
+            name: given by the browser; only its last part is used, cleaned.
             chunks: content.
 
         Raises:
@@ -186,16 +187,16 @@ class Draft:
                 if max(picture.size) > MASK_SIDES:
                     width, height = picture.size
                     raise BadInput(f"the mask has {width} x {height} pixels; its sides may have at most {MASK_SIDES}")
-                drawn = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
+                mask = picture.convert("L").resize(size, Image.Resampling.BICUBIC)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise BadInput("the mask is not a readable PNG; paint it again") from error
-        if drawn.getextrema() == (0, 0):
+        if mask.getextrema() == (0, 0):
             raise BadInput("the mask is empty: paint over the subject with the brush `keep`")
         png = io.BytesIO()
-        drawn.save(png, "PNG")
+        mask.save(png, "PNG")
         write_atomically(self.mask, png.getvalue())
 
-    def drawn_mask(self) -> Path:
+    def saved_mask(self) -> Path:
         """Return the file of the matte that the user drew.
 
         Raises:
@@ -257,7 +258,7 @@ def check_upload(path: Path, name: str) -> None:
         BadInput: says what it is and what to give.
     """
     try:
-        if path.suffix in FORMATS:
+        if path.suffix in MODEL_SUFFIXES:
             check_model(path)
         else:
             check_media(path)
@@ -268,7 +269,7 @@ def check_upload(path: Path, name: str) -> None:
 
 def kind_of(path: Path) -> Kind:
     """Return the kind of a checked file; an animated WebP counts as a picture that may move."""
-    if path.suffix in FORMATS:
+    if path.suffix in MODEL_SUFFIXES:
         return "model"
     with path.open("rb") as file:
         head = file.read(SNIFFED_BYTES)

@@ -55,7 +55,7 @@ class Filter(Frozen):
     page: int = Field(1, ge=1, le=10_000)
 
     def takes(self, asset: "Asset", now: datetime) -> bool:
-        """Return true if the gallery shows an asset."""
+        """Return true if an asset matches the filter."""
         newest = asset.newest
         words = self.search.lower().split()
         return (
@@ -157,8 +157,8 @@ def find(store: ArtifactStore, key: str) -> Asset:
     return found
 
 
-def chosen(found: Sequence[Asset], wanted: Filter) -> list[Asset]:
-    """Return the assets that a filter takes."""
+def filtered(found: Sequence[Asset], wanted: Filter) -> list[Asset]:
+    """Return the assets that match a filter."""
     now = datetime.now(UTC)
     return [asset for asset in found if wanted.takes(asset, now)]
 

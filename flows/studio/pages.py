@@ -25,6 +25,7 @@ MOTIONS: tuple[str, ...] = get_args(Motion)
 DESCRIPTIONS = {
     "preview": "minutes on any machine, no model",
     "paper": "the paper's numbers; GPU and weights",
+    "paper-lgm": "the paper's variant with LGM as the static stage; GPU and weights",
     "video": "for input videos, 32 frames; GPU and weights",
     "video-fast": "for input videos, 16 frames; GPU and weights",
     "release": "the public code's first release; GPU and weights",
@@ -55,10 +56,10 @@ class Pages:
         """Return the first page: drop zone, running conversions, gallery."""
         wanted = gallery.Filter.model_validate(dict(request.query_params))
         found = await run_in_threadpool(lambda: gallery.assets(home.store()))
-        chosen = gallery.chosen(found, wanted)
-        shown = gallery.page_of(chosen, wanted.page)
-        last = max(1, -(-len(chosen) // gallery.PAGE))
-        values = {"assets": shown, "count": len(chosen), "total": len(found), "filter": wanted, "last": last}
+        selected = gallery.filtered(found, wanted)
+        shown = gallery.page_of(selected, wanted.page)
+        last = max(1, -(-len(selected) // gallery.PAGE))
+        values = {"assets": shown, "count": len(selected), "total": len(found), "filter": wanted, "last": last}
         values["pages"] = {n: _query(wanted, n) for n in (wanted.page - 1, wanted.page + 1) if 1 <= n <= last}
         if request.headers.get("x-fragment"):
             return _page("cards.html", **values)

@@ -1,4 +1,4 @@
-"""Steps that the studio page waits for: the cut-out, and films of motions, in child processes of the server.
+"""Steps that the studio page waits for: the cut-out, and preview videos of motions, in child processes of the server.
 
 They take no slot: they are small, and would otherwise wait for the fit of another asset. Results are recorded as those
 of conversions are, so an equal step of a conversion takes them.
@@ -25,7 +25,7 @@ from steps.runtime.installed_code import catalog
 
 MOTIONS = 6  # weights-free motions
 CUTOUT_SIZE = 384  # pixels; mattes are estimated at up to twice as many
-FILM_SIZE = 256  # pixels of the subject in the films
+PREVIEW_SIZE = 256  # size of the subject in the preview videos, pixels
 AT_ONCE = threading.Semaphore(2)
 
 
@@ -55,12 +55,12 @@ class CutOut(Frozen):
     problem: str
 
 
-class Film(Frozen):
-    """Film of a motion.
+class MotionPreview(Frozen):
+    """Preview video of a motion.
 
     Attributes:
         motion: value of `driving.motion`.
-        address: of the film, MP4.
+        address: of the video, MP4.
     """
 
     motion: str
@@ -68,7 +68,7 @@ class Film(Frozen):
 
 
 def warm_up() -> None:
-    """Start the fork server, whose imports the first cut-out would otherwise wait for."""
+    """Start the fork server early, so that the first cut-out does not wait for its imports."""
     prepare()
 
 
@@ -90,8 +90,10 @@ def cut_out(draft: Draft, upload: Upload, box: tuple[int, ...] = ()) -> CutOut:
     return CutOut(**facts, **found)
 
 
-def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bool = False) -> list[Film]:
-    """Return films of the motions that a profile can choose from; none where a model generates the motion.
+def motion_previews(
+    draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bool = False
+) -> list[MotionPreview]:
+    """Return preview videos of the motions that a profile offers; none if a model generates the motion.
 
     Raises:
         StepError: the file cannot be read, or has no subject.
@@ -101,10 +103,10 @@ def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bo
     settings = profile(profile_name)
     if upload.kind != "picture" or not isinstance(settings.driving, WarpSettings):
         return []
-    changes: dict[str, Any] = {"driving.candidates": MOTIONS, "driving.motion": "sway", "subject.size": FILM_SIZE}
+    changes: dict[str, Any] = {"driving.candidates": MOTIONS, "driving.motion": "sway", "subject.size": PREVIEW_SIZE}
     settings = revise(settings, changes | ({"subject.box": list(box)} if box and not masked else {}))
     conversion = Conversion(item=draft.identifier, settings=settings)
-    mask = put_source(draft.drawn_mask(), home.store()) if masked else None
+    mask = put_source(draft.saved_mask(), home.store()) if masked else None
     subject = _run("prepare_subject", source=_source(upload), conversion=conversion, mask=mask)
     if "footage" in subject.outputs:
         return []
@@ -112,7 +114,7 @@ def films(draft: Draft, profile_name: str, box: tuple[int, ...] = (), masked: bo
     ranking = home.store().load_json(video.outputs["ranking"])
     address = entry_address(video.outputs["films"])
     rows = sorted(ranking["candidates"], key=lambda row: int(row["number"]))
-    return [Film(motion=row["name"], address=f"{address}{row['number']}.mp4") for row in rows]
+    return [MotionPreview(motion=row["name"], address=f"{address}{row['number']}.mp4") for row in rows]
 
 
 def entry_address(archive: ArtifactRef) -> str:

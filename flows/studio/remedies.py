@@ -134,7 +134,7 @@ def _known(names: Collection[str], steps: Sequence[VersionStep]) -> dict[str, An
 
 
 def _allowed(candidate: Candidate, settings: PipelineSettings, steps: Collection[str]) -> Remedy | None:
-    """Return what of a remedy the steps read; None if it changes nothing, or a value or name is not allowed."""
+    """Return the changes of a remedy that steps read; None if nothing changes, or a value or name is not allowed."""
     try:
         remedy = candidate(settings)
         remedy = remedy._replace(changes={k: value for k, value in remedy.changes.items() if is_read(k, steps)})

@@ -93,7 +93,7 @@ def routes(api: ServerApi) -> list[Route]:
         Route("/drafts/{identifier}/runs", changes.convert, True),
         Route("/runs/{identifier}/cancel", changes.cancel, True),
         Route("/runs/{identifier}/retry", changes.retry, True),
-        Route("/assets/{key}/again", changes.again, True),
+        Route("/assets/{key}/again", changes.repeat, True),
     ]
 
 

@@ -103,7 +103,7 @@ class ServerApi:
         )
 
     async def cancel(self, run: Row) -> None:
-        """Ask for the end of a run; one that has not begun never begins, and a crashed one is not started again.
+        """Cancel a run: a scheduled run never starts, and a crashed one is not restarted.
 
         Raises:
             HTTPException: 409; it cannot be cancelled.

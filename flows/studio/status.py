@@ -96,7 +96,7 @@ class RunStatus(Frozen):
 
     @property
     def has_ended(self) -> bool:
-        """True if nothing more happens by itself."""
+        """True if the run is in a final state."""
         return self.state in {"done", "failed", "cancelled"}
 
 
@@ -148,7 +148,7 @@ async def full(run: Row, api: ServerApi, now: float) -> RunStatus:
             "steps": steps,
             "left": format_left(schedule.seconds_left(now)) if running else "",
             "picture": newest_picture(artifacts),
-            "first_look": newest_look(artifacts),
+            "first_look": newest_splats_page(artifacts),
         }
     )
 
@@ -200,7 +200,7 @@ def newest_picture(artifacts: Iterable[Row]) -> str:
     return ""
 
 
-def newest_look(artifacts: Iterable[Row]) -> str:
+def newest_splats_page(artifacts: Iterable[Row]) -> str:
     """Return the address of the newest page with static splats."""
     for artifact in sorted(artifacts, key=lambda row: str(row["updated"]), reverse=True):
         if match := LOOK.search(str(artifact["data"])):

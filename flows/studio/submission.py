@@ -118,8 +118,8 @@ def _batch(draft: Draft, wanted: Submission) -> RunRequest:
     return RunRequest(_deployment("catalog-to-4d", "Catalog", wanted.profile), name, parameters, (draft_tag(draft),))
 
 
-def again(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = None) -> RunRequest:
-    """Return a run as an earlier one, with changed settings, into a folder of its own.
+def repetition(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = None) -> RunRequest:
+    """Return a repetition of an earlier run with changed settings, into a folder of its own.
 
     Args:
         run: flow run that the page started.
@@ -139,7 +139,7 @@ def again(run: Mapping[str, Any], settings: tuple[str, ...], seed: int | None = 
 
 
 def retry(run: Mapping[str, Any]) -> RunRequest:
-    """Return a run equal to an earlier one, which goes on after its last finished step."""
+    """Return a run equal to an earlier one; it resumes after the last finished step."""
     return _same_deployment(run, dict(run["parameters"]))
 
 
@@ -168,7 +168,7 @@ def _same_deployment(run: Mapping[str, Any], parameters: dict[str, Any]) -> RunR
 
 
 def _deployment(flow: str, title: str, profile_name: str) -> str:
-    """Return the deployment of a flow; profiles other than `preview` want a GPU."""
+    """Return the deployment of a flow; profiles other than `preview` need a GPU."""
     return f"{flow}/{title} to 4D{'' if profile_name == 'preview' else GPU}"
 
 
@@ -194,7 +194,7 @@ def _mask(draft: Draft, wanted: Submission, first: Upload, key: str) -> str:
         return ""
     if first.kind != "picture":
         raise BadInput("the brush works on pictures only; draw a box, which applies to all frames of a video")
-    return str(draft.link(key, "mask.png", draft.drawn_mask()))
+    return str(draft.link(key, "mask.png", draft.saved_mask()))
 
 
 def _view(draft: Draft, view: SideView, first: Upload, key: str) -> str:

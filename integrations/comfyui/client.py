@@ -20,7 +20,7 @@ WORKER = Path(__file__).with_name("worker.py")
 PYTHON = "DG4D_PYTHON"
 PYTHON_FILE = Path(__file__).with_name("python.txt")
 CHECKOUT_PYTHON = Path(__file__).resolve().parents[2] / ".venv" / "bin" / "python"
-POLL_S = 0.2  # between two looks at ComfyUI's interrupt
+POLL_S = 0.2  # between two checks of ComfyUI's interrupt
 GRACE_S = 15.0  # for the steps to end after an interrupt
 KEPT_LINES = 20  # of standard error, for messages
 HIDDEN = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV")  # of ComfyUI's environment
@@ -96,7 +96,7 @@ def _converse(
     threading.Thread(target=_collect, args=(child.stdout, lines.put), daemon=True).start()
     listener = threading.Thread(target=_collect, args=(child.stderr, said.append), daemon=True)
     listener.start()
-    with contextlib.suppress(BrokenPipeError):  # it ended: what it wrote to standard error says why
+    with contextlib.suppress(BrokenPipeError):  # it ended: standard error has the reason
         child.stdin.write(json.dumps(request) + "\n")
         child.stdin.flush()
     while True:

@@ -15,7 +15,7 @@ from . import client, media
 
 ASSET = "ASSET_4D"  # type of the sockets: folder of a package
 CATEGORY = "3d/dg4d"
-PROFILES = ["preview", "paper", "video", "video-fast", "release", "reference", "quality", "open"]
+PROFILES = ["preview", "paper", "paper-lgm", "video", "video-fast", "release", "reference", "quality", "open"]
 AS_PROFILE = "as the profile"
 MOTIONS = [AS_PROFILE, "sway", "bend", "breathe", "bounce", "wave", "turn"]
 BACKGROUNDS = {"white": 1.0, "gray": 0.5, "black": 0.0}

@@ -112,7 +112,7 @@ def emit(event: str, **values: Any) -> None:
 def main() -> int:
     """Serve one request."""
     _Answers.stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what libraries print must not reach the pipe
+    os.dup2(2, 1)  # output of libraries must not reach the pipe
     request = json.loads(sys.stdin.readline())
     threading.Thread(target=_interrupt_at_the_end_of_input, daemon=True).start()
     try:

@@ -24,17 +24,8 @@ from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from steps.artifacts.media import write_png
-from steps.artifacts.packages import (
-    ASSET,
-    COMPACT,
-    MANIFEST,
-    MERGED,
-    MESHES,
-    SPLATS,
-    Manifest,
-    read_file,
-    read_manifest,
-)
+from steps.artifacts.package_files import ASSET, COMPACT, MANIFEST, MERGED, MESHES, SPLATS
+from steps.artifacts.packages import Manifest, read_file, read_manifest
 
 BATCH = 8  # pictures per rasterizer call, bounds the memory
 SMALLEST, LARGEST = 16, 4096  # pixels of a side
@@ -67,6 +58,7 @@ def render_package(
     out: Path,
     rasterizer: str = "auto",
     fit: bool = False,
+    last: int | None = None,
 ) -> Renders:
     """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and frame.
 
@@ -81,6 +73,7 @@ def render_package(
         rasterizer: name of the rasterizer for splats.
         fit: take the field of view that holds the whole asset from all sides (`whole_fov_y_deg` of the manifest)
             instead of that of the input picture.
+        last: picture of `frames` that shows the last frame of the fit, as later ones do; None: the last picture.
 
     Raises:
         BadInput: the folder is not a package, a broken one, or too old for `fit`, a number is out of range, or a view
@@ -95,7 +88,7 @@ def render_package(
     else:
         draw = splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
     every = torch.arange(manifest.frames, dtype=torch.float64)
-    positions = every if frames is None else fitted_positions(frames, folder, manifest)
+    positions = every if frames is None else fitted_positions(frames, folder, manifest, last)
     fov_y_deg = _whole_fov_y_deg(folder, manifest) if fit else FOV_Y_DEG
     count, cropped = len(positions), 0
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
@@ -141,14 +134,21 @@ def _touches_edge(picture: Float[Tensor, "h w 4"]) -> bool:
     return any(bool((edge > OPAQUE).any()) for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
 
 
-def fitted_positions(count: int, folder: Path, manifest: Manifest) -> Float[Tensor, " n"]:
+def fitted_positions(count: int, folder: Path, manifest: Manifest, last: int | None = None) -> Float[Tensor, " n"]:
     """Return evenly spaced positions from the first to the last frame of the fit, in frames of the package.
 
     The last frames of a package with another frame rate than the fit (`pack.fps`) lead back to the first.
+
+    Args:
+        count: number of positions.
+        folder: unpacked package.
+        manifest: of the package.
+        last: index of the position of the last frame, which later ones repeat; None: the last position.
     """
     fitted = read_compact(folder / COMPACT).frames if (folder / COMPACT).is_file() else manifest.frames
-    last = (fitted - 1) * manifest.frames / fitted
-    return torch.arange(count, dtype=torch.float64) * last / max(1, count - 1)
+    end = (fitted - 1) * manifest.frames / fitted
+    last = count - 1 if last is None else last
+    return torch.arange(count, dtype=torch.float64).clamp(max=last) * end / max(1, last)
 
 
 def read_states(folder: Path, manifest: Manifest) -> States:
@@ -230,9 +230,9 @@ def splat_renderer(states: States, rasterizer: Rasterizer) -> Renderer:
 
     def draw(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
         with torch.no_grad():
-            drawn = rasterizer(states(positions), cameras, torch.zeros(3))
-        straight = drawn.color / drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
-        return torch.cat([straight, drawn.alpha], -1).clamp(0, 1)
+            rendering = rasterizer(states(positions), cameras, torch.zeros(3))
+        straight = rendering.color / rendering.alpha.clamp_min(torch.finfo(rendering.alpha.dtype).tiny)
+        return torch.cat([straight, rendering.alpha], -1).clamp(0, 1)
 
     return draw
 

@@ -43,15 +43,21 @@ ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # FFmpeg's own decoders
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """Return at most `most` indices below `count`, first and last included, as evenly as integers allow."""
+    """Return at most `most` indices below `count`, evenly spaced from the first on.
+
+    Where `most` divides `count` they have one distance, such as every second frame of a video in the paper's fast
+    variant. Otherwise the last index is included, and distances differ by at most 1.
+    """
     if count <= most:
         return list(range(count))
+    if count % most == 0:
+        return list(range(0, count, count // most))
     return [round(i * (count - 1) / (most - 1)) for i in range(most)]
 
 
 def thinned_rate(fps: float, count: int, kept: int) -> float:
     """Return the rate at which `kept` evenly spaced frames of `count` move as fast as all of them do."""
-    return fps * (kept - 1) / (count - 1) if count > 1 else fps
+    return fps * (kept - 1) / evenly_spaced(count, kept)[-1] if kept > 1 else fps
 
 
 def measured_rate(times: Sequence[float]) -> float:
@@ -68,7 +74,7 @@ def shown_times(times: Sequence[float]) -> list[float]:
 
 
 def uneven_note(times: Sequence[float]) -> tuple[str, ...]:
-    """Return a note if frames at these times, in seconds, look different when they are played at an even rate."""
+    """Return a note if frames at these times, in seconds, move differently at a constant frame rate."""
     rate = measured_rate(times)
     late = max((abs((time - times[0]) * rate - i) for i, time in enumerate(times)), default=0.0)
     if late <= UNEVEN * (len(times) - 1):
@@ -173,7 +179,7 @@ class Clip:
                 self._header_rate = float(stream.average_rate or 0)
                 name = ALPHA_DECODERS.get(context.name, "") if stream.metadata.get("alpha_mode") == "1" else ""
                 decoder = cast(VideoCodecContext, av.CodecContext.create(name, "r")) if name else context
-                decoder.options = {"max_pixels": str(MOST_PIXELS)}  # frames may be larger than the header says
+                decoder.options = {"max_pixels": str(MOST_PIXELS)}  # frames may be larger than the header declares
                 frames = (frame for packet in container.demux(stream) for frame in decoder.decode(packet))
                 yield from self._bounded(frames)
         except FFmpegError as error:
