@@ -84,8 +84,8 @@ def waving_ball(rows: int, texels: int) -> Asset4D:
     upper, lower = torch.stack([a, c, b], -1), torch.stack([b, c, d], -1)
     faces = torch.cat([upper[2 * rows :], lower[: -2 * rows]])  # drops the degenerate ones at the poles
     mesh = TexturedMesh(rest, faces, torch.stack([u, v], -1).reshape(-1, 2), noise_picture(texels))
-    moments = torch.arange(FRAMES)[:, None, None] / FRAMES
-    return Asset4D(mesh, 0.05 * torch.sin(2 * math.pi * (moments + rest[:, [1, 2, 0]])), FPS)
+    times = torch.arange(FRAMES)[:, None, None] / FRAMES
+    return Asset4D(mesh, 0.05 * torch.sin(2 * math.pi * (times + rest[:, [1, 2, 0]])), FPS)
 
 
 def on_ball(places: Tensor) -> Tensor:

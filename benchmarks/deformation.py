@@ -55,12 +55,12 @@ def naive_features(coordinates: Tensor, times: Tensor, space: Tensor, time: Tens
     """Return the product of six samples at every Gaussian and timestamp."""
     t, n = len(times), len(coordinates)
     everywhere = coordinates.expand(t, n, 3).reshape(-1, 3)
-    moments = (2 * times - 1)[:, None].expand(t, n).reshape(-1)
+    timestamps = (2 * times - 1)[:, None].expand(t, n).reshape(-1)
     product = torch.ones(())
     for plane, axes in zip(space, SPATIAL_AXES, strict=True):
         product = product * sampled(plane, everywhere[:, list(axes)])
     for axis, plane in enumerate(time):
-        product = product * sampled(plane, torch.stack([everywhere[:, axis], moments], -1))
+        product = product * sampled(plane, torch.stack([everywhere[:, axis], timestamps], -1))
     return product.unflatten(0, (t, n))
 
 
@@ -162,7 +162,7 @@ def main() -> None:
     counts, sizes, rounds = ((2_000,), (128,), 3) if options.quick else ((5_000, 20_000), (256, 512), 5)
     console, rows = new_console(), []
     for settings in (paper,) if options.quick else (paper, small):
-        title = f"{machine()}; {settings.features} features, {settings.hidden} hidden units, {TIMES} moments"
+        title = f"{machine()}; {settings.features} features, {settings.hidden} hidden units, {TIMES} timestamps"
         found = [row for count in counts for row in measure_deformation(count, settings, rounds)]
         console.print(table(title, found))
         rows += found if settings is paper else []  # rows do not contain the number of features

@@ -40,7 +40,7 @@ def mesh_depth(path: Path, size: int) -> Float[Tensor, "s s"]:
 def hints_of(depth: Float[Tensor, "s s"], alpha: Float[Tensor, "s s"]) -> dict[str, DepthHint]:
     """Return hints of several kinds.
 
-    "place" tells distances and the subject's place along the view, which no depth picture of a single subject does.
+    "place" gives distances and the position along the view, which no depth picture of a single subject contains.
 
     Args:
         depth: distance of the first surface from the camera's plane, world units; 0 where there is none.

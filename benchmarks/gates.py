@@ -40,7 +40,8 @@ from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 from flows.packages.publish import load_verified
 from steps.artifacts.media import read_frames, read_png
-from steps.artifacts.packages import SUBJECT, read_manifest
+from steps.artifacts.package_files import SUBJECT
+from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import read_states, read_surface
 from steps.check_asset import LoadedAsset, collect_evidence
 from steps.contract import ArtifactRef

@@ -94,8 +94,8 @@ def bumpy_ball(faces: int, size: int, frames: int) -> Scene:
     index = torch.arange(len(rest), dtype=torch.int32).reshape(u.shape)
     a, b, c, d = (part.flatten() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     triangles = torch.cat([torch.stack([a, b, c], -1), torch.stack([b, d, c], -1)])
-    moments = torch.arange(frames)[:, None, None] / frames
-    states = rest + 0.04 * torch.sin(2 * math.pi * (moments + rest[:, [1, 2, 0]]))
+    times = torch.arange(frames)[:, None, None] / frames
+    states = rest + 0.04 * torch.sin(2 * math.pi * (times + rest[:, [1, 2, 0]]))
     uvs = torch.stack([u, v], -1).reshape(-1, 2)
     return Scene(states, triangles, uvs, turntable(frames, OrbitCamera(12.0, width=size, height=size)))
 

@@ -30,7 +30,8 @@ from dg4d_lib.metrics.image import iou, psnr
 from dg4d_lib.metrics.surface import chamfer_distance, sample_surface
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.settings import MeshSettings
-from steps.artifacts.packages import COMPACT, read_manifest
+from steps.artifacts.package_files import COMPACT
+from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import read_surface
 from steps.extract_mesh import textured_mesh
 
@@ -65,10 +66,10 @@ def measure_package(folder: Path, count: int, rasterize: Rasterizer) -> list[Row
     gaussians, deformation, frames = fit.gaussians, fit.deformation, fit.frames
     first = pose_gaussians(gaussians, deformation, frames, torch.zeros(1)).at(0)
     level, _ = select_level(density_field(first, SETTINGS), first, rasterize, SETTINGS.density_threshold)
-    chosen = [i * frames // count for i in range(count)]
-    states = pose_gaussians(gaussians, deformation, frames, torch.tensor(chosen, dtype=torch.float32))
+    selected = [i * frames // count for i in range(count)]
+    states = pose_gaussians(gaussians, deformation, frames, torch.tensor(selected, dtype=torch.float32))
     rows = []
-    for i, frame in enumerate(chosen):
+    for i, frame in enumerate(selected):
         extracted = textured_mesh(states.at(i), level, rasterize, SETTINGS)
         tracked = replace(asset.mesh, vertices=asset.mesh.vertices + asset.offsets[frame])
         ground_truth, generator = splats(states.at(i), rasterize), torch.Generator().manual_seed(frame)
@@ -86,8 +87,8 @@ def cameras() -> list[OrbitCamera]:
 def splats(state: Gaussians, rasterize: Rasterizer) -> tuple[Tensor, Tensor]:
     """Return color over white, and alpha."""
     with torch.no_grad():
-        drawn = rasterize(state, cameras(), torch.ones(3))
-    return drawn.color, drawn.alpha
+        rendering = rasterize(state, cameras(), torch.ones(3))
+    return rendering.color, rendering.alpha
 
 
 def compare_renders(mesh: TexturedMesh, ground_truth: tuple[Tensor, Tensor]) -> list[float]:

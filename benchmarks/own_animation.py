@@ -1,9 +1,9 @@
-"""A rigged model driven by renders of an animation of its own: what `--asset` finds of it, beside the frozen truth.
+"""Rigged models driven by renders of their own animations with `--asset`, against the frozen ground truth.
 
     python -m benchmarks.own_animation MODEL.glb ... [--animation RUN] [--azimuth DEG] [--frames N] [--sheets DIR]
     python -m benchmarks.own_animation MODEL.glb --set asset.skeleton=false
 
-The model rests as its file has it, and the video is what the input camera sees of the animation, by name or number.
+The model is at rest as in its file; the video shows the animation, given by name or number, from the input camera.
 Columns and figures are those of `benchmarks.own_asset`.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks import own_asset
 from benchmarks.measure import parser_of
-from benchmarks.own_asset import COLUMNS, FPS, OwnModel, draw_model, write_line
+from benchmarks.own_asset import COLUMNS, FPS, OwnModel, render_model, write_line
 from benchmarks.true_views import SIZE, Figures, Subject, mean, write_sheet
 
 import numpy as np  # isort: skip
@@ -25,7 +25,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.asset_settings import AssetSettings
-from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, moved_pieces, read_foreign_glb
+from dg4d_lib.assets.formats.foreign_glb import ForeignGlb, read_foreign_glb
+from dg4d_lib.assets.formats.foreign_nodes import global_matrices, mesh_matrices, transform_points
 from dg4d_lib.assets.formats.gltf import read_accessor
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
@@ -35,14 +36,14 @@ from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from steps.animate_asset import controlled, moved_vertices
+from steps.animate_asset import attach_controls, moved_vertices
 from steps.prepare_asset import cover, posed_model
 from steps.profiles import PREVIEW, revise
 from steps.sources.models import embed_files
 
 AZIMUTHS = (-75.0, 15.0, 105.0, 195.0)
-SPAN = 0.75  # of the frame, that the animation fills
-DRAWN = 2 * SIZE  # pixels of the video
+SPAN = 0.75  # share of the frame that the animation fills
+VIDEO_SIZE = 2 * SIZE  # pixels of the video
 
 
 def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
@@ -55,12 +56,12 @@ def read_mesh(path: Path, settings: AssetSettings) -> ForeignGlb:
 
 
 def played(glb: ForeignGlb, animation: str, frames: int) -> Float[np.ndarray, "t v 3"]:
-    """Return the vertices of a model at evenly spaced moments of an animation, in its own coordinates.
+    """Return the vertices of a model at evenly spaced times of an animation, in its own coordinates.
 
     Args:
         glb: the model; its nodes are moved.
         animation: name or number.
-        frames: number of moments.
+        frames: number of times.
 
     Raises:
         BadInput: there is no such animation.
@@ -69,16 +70,30 @@ def played(glb: ForeignGlb, animation: str, frames: int) -> Float[np.ndarray, "t
     names = [str(one.get("name", number)) for number, one in enumerate(animations)]
     if animation not in names and not (animation.isdigit() and int(animation) < len(animations)):
         raise BadInput(f"the model has no animation {animation!r}; given are {', '.join(names) or 'none'}")
-    chosen = animations[names.index(animation) if animation in names else int(animation)]
-    tracks = [_track(glb, chosen, channel) for channel in chosen["channels"] if channel["target"]["path"] != "weights"]
+    selected = animations[names.index(animation) if animation in names else int(animation)]
+    tracks = [
+        _track(glb, selected, channel) for channel in selected["channels"] if channel["target"]["path"] != "weights"
+    ]
     end = max(float(times[-1]) for _, _, times, _ in tracks)
-    moments = []
+    poses = []
     for frame in range(frames):
         for node, path, times, values in tracks:
             glb.reader.tree["nodes"][node].pop("matrix", None)
             glb.reader.tree["nodes"][node][path] = _between(times, values, end * frame / frames, path).tolist()
-        moments.append(moved_pieces(glb))
-    return np.stack(moments)
+        poses.append(_moved_pieces(glb))
+    return np.stack(poses)
+
+
+def _moved_pieces(glb: ForeignGlb) -> Float[np.ndarray, "v 3"]:
+    """Return the vertices of all pieces where the nodes of the file are now, in the coordinates of the model."""
+    globals_ = global_matrices(glb.reader.tree)
+    places = [
+        transform_points(
+            mesh_matrices(glb.reader, piece.node, piece.primitive, globals_), piece.local.astype(np.float64)
+        )
+        for piece in glb.pieces
+    ]
+    return np.concatenate(places).astype(np.float32)
 
 
 def _track(glb: ForeignGlb, animation: dict[str, Any], channel: dict[str, Any]) -> tuple[int, str, Any, Any]:
@@ -90,15 +105,15 @@ def _track(glb: ForeignGlb, animation: dict[str, Any], channel: dict[str, Any]) 
 
 
 def _between(
-    times: Float[np.ndarray, " k"], values: Float[np.ndarray, "k c"], moment: float, path: str
+    times: Float[np.ndarray, " k"], values: Float[np.ndarray, "k c"], time: float, path: str
 ) -> Float[np.ndarray, " c"]:
-    """Return the value at a moment, along a straight line between two keys."""
-    after = int(np.searchsorted(times, moment).clip(1, max(len(times) - 1, 1)))
+    """Interpolate linearly between two keys."""
+    after = int(np.searchsorted(times, time).clip(1, max(len(times) - 1, 1)))
     first, second = values[after - 1], values[min(after, len(times) - 1)]
     if path == "rotation" and first @ second < 0:
         second = -second
     gap = float(times[min(after, len(times) - 1)] - times[after - 1])
-    share = float(np.clip((moment - times[after - 1]) / gap, 0, 1)) if gap > 0 else 0.0
+    share = float(np.clip((time - times[after - 1]) / gap, 0, 1)) if gap > 0 else 0.0
     mixed: Float[np.ndarray, " c"] = (1 - share) * first + share * second
     return mixed / np.linalg.norm(mixed) if path == "rotation" else mixed
 
@@ -113,25 +128,25 @@ def read_rigged(path: Path, animation: str, frames: int, azimuth: float) -> tupl
     half = math.tan(math.radians(OrbitCamera().fov_y_deg) / 2) * RADIUS * SPAN
     world = torch.from_numpy((turned - (low + high) / 2) * (half / (0.5 * max((high - low)[:2]))))
     model, cameras = rest.model, [OrbitCamera(0, one, width=SIZE, height=SIZE) for one in AZIMUTHS]
-    footage = draw_model(model, world, OrbitCamera(width=DRAWN, height=DRAWN))
-    views = {one: draw_model(model, world, camera) for one, camera in zip(AZIMUTHS, cameras, strict=True)}
+    footage = render_model(model, world, OrbitCamera(width=VIDEO_SIZE, height=VIDEO_SIZE))
+    views = {one: render_model(model, world, camera) for one, camera in zip(AZIMUTHS, cameras, strict=True)}
     faces = torch.from_numpy(model.faces).long()
     own = OwnModel(Subject(path.stem, footage, views), model, world.float(), faces, torch.ones(len(faces)))
     return own, rest
 
 
 def animate(own: OwnModel, glb: ForeignGlb, settings: AssetSettings) -> tuple[Float[Tensor, "t v 3"], str]:
-    """Place the model, pose it and fit its motion, as the steps do; also tell how."""
+    """Place the model, pose it and fit its motion, as the steps do; also return a summary."""
     rasterize, generator = get_rasterizer("auto"), torch.Generator().manual_seed(0)
-    footage, whole = own.subject.footage, cover(glb, settings, 0)
-    placement = find_placement(whole.cloud, footage[0], rasterize)
+    footage, covered = own.subject.footage, cover(glb, settings, 0)
+    placement = find_placement(covered.cloud, footage[0], rasterize)
     said = f"outlines {placement.agreement:.3f}"
-    posed = posed_model(glb, whole, placement, footage[0], rasterize, settings, ("y",))
+    posed = posed_model(glb, covered, placement, footage[0], rasterize, settings, ("y",))
     if posed is not None:
         placement = posed.placement
         said += f" at rest, {placement.agreement:.3f} posed"
-    surface = whole.placed(placement.quat, placement.scale, placement.shift)
-    mesh = controlled(glb, placement, surface, settings)
+    surface = covered.placed(placement.quat, placement.scale, placement.shift)
+    mesh = attach_controls(glb, placement, surface, settings)
     video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
     if mesh.joints is None:
         bound = mesh.graph.of(surface.nearest)

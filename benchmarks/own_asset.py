@@ -1,4 +1,4 @@
-"""Quality of `--asset`: true meshes of the first frame, driven by their videos, beside the frozen truth.
+"""Quality of `--asset`: true meshes of the first frame, driven by their videos, against the frozen ground truth.
 
     python -m benchmarks.own_asset FOLDER [--only panda mage] [--sheets DIR]
     python -m benchmarks.own_asset --synthetic
@@ -87,7 +87,7 @@ def read_models(folder: Path, names: Sequence[str] = ()) -> Iterator[OwnModel]:
 
 
 def synthetic_models(frames: int, names: Sequence[str] = ()) -> Iterator[OwnModel]:
-    """Draw our own objects, for tuning."""
+    """Render our own objects, for tuning."""
     azimuths = (-75.0, 15.0, 105.0, 195.0)
     cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in (0.0, *azimuths)]
     for name, make in OBJECTS.items():
@@ -137,8 +137,8 @@ def _grown(texture: np.ndarray, rows: Tensor, columns: Tensor) -> np.ndarray:
     return texture[tuple(nearest)]
 
 
-def draw_model(model: Model, moved: Float[Tensor, "t v 3"], camera: OrbitCamera) -> Float[Tensor, "t s s 4"]:
-    """Draw a model unlit at all frames, straight alpha."""
+def render_model(model: Model, moved: Float[Tensor, "t v 3"], camera: OrbitCamera) -> Float[Tensor, "t s s 4"]:
+    """Render a model unlit at all frames, straight alpha."""
     fine = replace(camera, width=2 * camera.width, height=2 * camera.height)
     frames = []
     for vertices in moved:
@@ -150,16 +150,16 @@ def draw_model(model: Model, moved: Float[Tensor, "t v 3"], camera: OrbitCamera)
         )
         picture[covered] = torch.cat([torch.from_numpy(colors), torch.ones(len(colors), 1)], 1)
         frames.append(avg_pool2d(picture.movedim(-1, 0)[None], 2)[0].movedim(0, -1))
-    drawn = torch.stack(frames)
-    return torch.cat([drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6), drawn[..., 3:]], -1)
+    rendering = torch.stack(frames)
+    return torch.cat([rendering[..., :3] / rendering[..., 3:].clamp(min=1e-6), rendering[..., 3:]], -1)
 
 
 def score(own: OwnModel, moved: Float[Tensor, "t v 3"], faces: Int[Tensor, "f 3"]) -> Figures:
-    """Compare renders and meshes of a motion with the truth."""
+    """Compare renders and meshes of a motion with the ground truth."""
     rows = []
     for azimuth, truth in _views(own.subject):
-        drawn = draw_model(own.model, moved, OrbitCamera(0, azimuth, width=SIZE, height=SIZE))
-        rows.append(true_views.figures(over_white(drawn), drawn[..., 3:], truth))
+        rendering = render_model(own.model, moved, OrbitCamera(0, azimuth, width=SIZE, height=SIZE))
+        rows.append(true_views.figures(over_white(rendering), rendering[..., 3:], truth))
     return {**mean(rows[1:]), "chamfer": _chamfer(own, moved, faces, None), "input": rows[0]["psnr"]}
 
 
@@ -198,9 +198,9 @@ def animate(own: OwnModel, settings: AssetSettings) -> tuple[Float[Tensor, "t v 
     """Place a subject's model and fit its motion; return its vertices at all frames and the number of flipped faces."""
     rasterize = get_rasterizer("auto")
     generator = torch.Generator().manual_seed(0)
-    footage, whole = own.subject.footage, cover_surface(own.model, settings.points, generator)
-    placement = find_placement(whole.cloud, footage[0], rasterize)
-    surface = whole.placed(placement.quat, placement.scale, placement.shift)
+    footage, covered = own.subject.footage, cover_surface(own.model, settings.points, generator)
+    placement = find_placement(covered.cloud, footage[0], rasterize)
+    surface = covered.placed(placement.quat, placement.scale, placement.shift)
     graph = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
     bound = graph.of(surface.nearest)
     video = DrivingVideo(footage[..., :3].contiguous(), footage[..., 3:].contiguous(), FPS)
@@ -214,10 +214,10 @@ def measure(
     show: Callable[[str], None],
     sheets: Path | None = None,
 ) -> dict[str, Figures]:
-    """Animate models and show the figures of each beside the frozen truth; return ours.
+    """Animate models and show the figures of each beside the frozen ground truth; return ours.
 
     Args:
-        models: with their truth.
+        models: with their ground truth.
         settings: of the fit.
         show: prints a line.
         sheets: folder for a contact sheet of each.
@@ -252,12 +252,12 @@ def row(name: str, figures: Figures) -> str:
 
 
 def sheet(own: OwnModel, moved: Float[Tensor, "t v 3"]) -> Float[Tensor, "h w 3"]:
-    """Draw some frames: for every view a row of the truth and one of ours."""
+    """Compose some frames: for every view a row of the ground truth and one of ours."""
     frames = torch.linspace(0, len(moved) - 1, SHEET_COLUMNS).round().long()
     rows = []
     for azimuth, truth in _views(own.subject):
         camera = OrbitCamera(0, azimuth, width=SHEET_SIZE, height=SHEET_SIZE)
-        ours = over_white(draw_model(own.model, moved[frames], camera))
+        ours = over_white(render_model(own.model, moved[frames], camera))
         theirs = resize(over_white(truth[frames]), (SHEET_SIZE, SHEET_SIZE))
         rows += [torch.cat(list(theirs), 1), torch.cat(list(ours), 1)]
     return torch.cat(rows)

@@ -9,11 +9,11 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera, intrinsics
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.rasterizer.interface import MAX_ALPHA, MAX_SIGMA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
 
 WHITE = torch.ones(3)

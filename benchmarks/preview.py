@@ -56,7 +56,7 @@ class Row:
     """Stage of both sides: medians over the turns, seconds; 0 where a side does not have it.
 
     Attributes:
-        stage: name of a step, or what is timed from the command on.
+        stage: name of a step, or of a time since the start of the command.
         before_s: wall time.
         after_s: wall time.
         before_cpu_s: CPU time of the process of the step; 0 for times from the command on.

@@ -23,7 +23,7 @@ from benchmarks.measure import Times, interleaved, machine, new_console, parser_
 import numpy as np  # isort: skip
 import torch
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from rich.table import Table
 from torch import Tensor
@@ -33,6 +33,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import turntable
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.spherical_harmonics import rgb_to_sh
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import LANES, LONG, SimdBuilder
 from dg4d_lib.kernels.workers import Scratch
 from dg4d_lib.rasterizer.cpu import pack_camera
@@ -114,22 +115,22 @@ def measure_cell(count: int, size: int, views: Sequence[int], rounds: int) -> tu
     fast, plain = get_rasterizer("cpu"), get_rasterizer("reference")
     cloud, several, missing = bumpy_ball(count), views[1], []
     functions: dict[str, Callable[[], object]] = {}
-    views_drawn: dict[str, float] = {}
+    views_rendered: dict[str, float] = {}
     for n in views:  # few views are repeated, so that a call takes long enough to measure
         times = max(1, several // n)
         functions[str(n)] = partial(draw, fast, cloud, ring(size, n), times)
-        views_drawn[str(n)] = n * times
+        views_rendered[str(n)] = n * times
     functions[OWN_STATES] = partial(draw, fast, bumpy_ball(count, several), ring(size, several))
-    views_drawn[OWN_STATES] = several
+    views_rendered[OWN_STATES] = several
     try:
         functions["gsplat_torch"] = partial(draw_peer, gsplat_torch(cloud, ring(size, 1)[0]), cloud)
     except ImportError:
         missing.append("gsplat_torch (pip install --no-deps gsplat==1.5.3)")
     small = replace(ring(size, 1)[0], width=SMALL, height=SMALL)
     functions["reference"] = partial(draw, plain, cloud, [small])
-    views_drawn["reference"] = (SMALL / size) ** 2
+    views_rendered["reference"] = (SMALL / size) ** 2
     taken = interleaved(functions, rounds)
-    return {name: times.per(views_drawn.get(name, 1)) for name, times in taken.items()}, missing
+    return {name: times.per(views_rendered.get(name, 1)) for name, times in taken.items()}, missing
 
 
 def comparison_rows(count: int, size: int, views: Sequence[int], taken: dict[str, Times]) -> Iterator[Row]:
@@ -169,11 +170,11 @@ def phases(count: int, size: int, rounds: int) -> tuple[dict[str, float], float]
         blend(records, offsets, entries, white, *planes, *kept, 0, across * across)
         marks.append(time.thread_time())
         slots = scratch.empty(entries.shape, np.uint32)
-        moments = scratch.empty((assign_rows(entries, count, slots), RECORD))
-        blend_backward(records, offsets, entries, white, *planes, *kept, slots, moments, 0, across * across)
-        add_duplicates(entries, slots, count, moments)
+        grad_records = scratch.empty((assign_rows(entries, count, slots), RECORD))
+        blend_backward(records, offsets, entries, white, *planes, *kept, slots, grad_records, 0, across * across)
+        add_duplicates(entries, slots, count, grad_records)
         marks.append(time.thread_time())
-        unproject(*state, coefficients, lens, keys, moments, *gradients, *more, 0, count)
+        unproject(*state, coefficients, lens, keys, grad_records, *gradients, *more, 0, count)
         marks.append(time.thread_time())
         taken = zip(PHASES, marks[:-1], marks[1:], strict=True)
         least = {name: min(least[name], (after - before) * 1e3) for name, before, after in taken}

@@ -27,7 +27,7 @@ from dg4d_lib.mesh.textured import TrackedMesh
 from dg4d_lib.refiner_settings import ImageToImageSettings, RefinerSettings, TextureSettings, VideoToVideoSettings
 from dg4d_lib.settings import VideoModelSettings, Zero123PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts.media import read_png, write_frames
+from steps.artifacts.media import read_png, write_frames, write_png
 from steps.artifacts.meshes import read_tracked, write_tracked
 from steps.profiles import profile, step_settings
 from steps.refine_texture import run
@@ -73,11 +73,12 @@ def run_refinement(asset: Asset4D, video: DrivingVideo, settings: RefinerSetting
     with TemporaryDirectory() as scratch:
         folder = Path(scratch)
         write_tracked(folder / "before", TrackedMesh(asset.mesh, asset.offsets))
+        write_png(folder / "subject.png", torch.cat([video.frames[0], video.alpha[0]], -1))
         write_frames(folder / "video", video)
-        inputs = {"tracked": folder / "before", "driving_video": folder / "video"}
+        inputs = {"tracked": folder / "before", "subject": folder / "subject.png", "driving_video": folder / "video"}
         outputs = {"tracked": folder / "after"}
-        chosen = profile("paper").model_copy(update={"refiner": settings})
-        run(Job(inputs, outputs, step_settings("refine_texture", chosen), seed, lambda *_: None, folder))
+        pipeline = profile("paper").model_copy(update={"refiner": settings})
+        run(Job(inputs, outputs, step_settings("refine_texture", pipeline), seed, lambda *_: None, folder))
         return read_tracked(folder / "after")
 
 

@@ -90,7 +90,7 @@ class Place:
 
 def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
     """Run an undisturbed conversion, then the trials."""
-    moments = random.Random(seed)
+    rng = random.Random(seed)
     duration_s = 0.0
     for trial in ("warm", "undisturbed"):  # the first run compiles kernels
         start = time.monotonic()
@@ -101,9 +101,9 @@ def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
     wanted = place.digests("undisturbed")
     rows = []
     for number in range(kills):
-        trial, moment_s = f"trial-{number}", moments.uniform(0, duration_s)
+        trial, delay_s = f"trial-{number}", rng.uniform(0, duration_s)
         command = place.start(trial)
-        time.sleep(moment_s)
+        time.sleep(delay_s)
         command.send_signal(signal.SIGKILL)
         said, _ = command.communicate()
         started = [line.split(":")[0] for line in said.splitlines() if ": started" in line]
@@ -111,7 +111,7 @@ def run_trials(place: Place, kills: int, seed: int) -> list[Row]:
         said, _ = (again := place.start(trial)).communicate()
         rows.append(
             Row(
-                killed_at_s=round(moment_s, 2),
+                killed_at_s=round(delay_s, 2),
                 during="the end" if command.returncode == 0 else started[-1] if started else "the start",
                 status=again.returncode,
                 kept=said.count(": cached"),

@@ -35,7 +35,7 @@ from steps.score_asset import MetricNetworks, ViewFrames, compare
 
 SIZE = 256  # pixels of the compared pictures
 COLUMNS = ("psnr", "psnr_obj", "iou", "terr", "motion", "flicker", "input")
-SHOWN = 4  # moments of a contact sheet, evenly spaced
+SHOWN = 4  # frames of a contact sheet, evenly spaced
 WITHOUT_NETWORKS = ScoreSettings(vgg_weights="", lpips_weights="", clip_weights="", i3d_weights="")
 
 Figures = dict[str, float]
@@ -123,9 +123,9 @@ def score_fit(subject: Subject, settings: PipelineSettings, sides: Bank | None =
     with torch.no_grad():
         for azimuth, truth in {0.0: resize(cutouts, (SIZE, SIZE)), **subject.views}.items():
             camera = OrbitCamera(0, azimuth, width=SIZE, height=SIZE)
-            drawn = [rasterize(moved.at(frame), [camera], torch.ones(3)) for frame in range(len(cutouts))]
-            color = torch.cat([picture.color for picture in drawn]).clamp(0, 1)
-            rows.append(figures(color, torch.cat([picture.alpha for picture in drawn]), truth[: len(cutouts)]))
+            renderings = [rasterize(moved.at(frame), [camera], torch.ones(3)) for frame in range(len(cutouts))]
+            color = torch.cat([one.color for one in renderings]).clamp(0, 1)
+            rows.append(figures(color, torch.cat([one.alpha for one in renderings]), truth[: len(cutouts)]))
             pair = [color[picked], over_white(truth[picked])]
             strips.append(torch.cat([torch.cat([*pictures], 1) for pictures in pair]))
     return {**mean(rows[1:]), "input": rows[0]["psnr"]}, torch.cat(strips[1:], 1)

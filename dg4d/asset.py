@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from dg4d_lib.errors import BadInput
 from flows.inputs.json_text import loads
-from flows.inputs.package_record import RECORD, record_of
+from flows.inputs.package_record import RECORD, REPORT, record_of
 from flows.packages.acceptance import failing_gates
 from flows.packages.publish import check_writable, load_verified
-from flows.packages.view import ASSET, MANIFEST, viewer_html, viewer_of_package
+from flows.packages.view import viewer_html, viewer_of_package
 from steps.artifacts.archives import unpack
+from steps.artifacts.package_files import ASSET, MANIFEST
 from steps.store.files import remove_tree
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from steps.artifacts.packages import Manifest
     from steps.artifacts.rendering import Renderer, States
 
-REPORT = "report.json"
 APPLE_DOUBLE = "__MACOSX"  # folder that macOS adds to zips, for attributes of files
 FRAME_HEIGHT = 520  # pixels of the viewer in a notebook
 ROUNDING = 1e-6  # frames by which a time counts as that of a frame
@@ -176,8 +176,8 @@ class Asset:
 
         camera = OrbitCamera() if camera is None else camera
         _check_size(camera)
-        drawn = (self._draw_mesh if mesh else self._draw_gaussians)(self._position(t), [camera])
-        picture: NDArray[np.float32] = drawn[0].detach().float().cpu().numpy()
+        rendered = (self._render_mesh if mesh else self._render_gaussians)(self._position(t), [camera])
+        picture: NDArray[np.float32] = rendered[0].detach().float().cpu().numpy()
         return picture
 
     def save_glb(self, path: str | Path) -> Path:
@@ -252,14 +252,14 @@ class Asset:
         return read_surface(self._checked_folder(), self.manifest)
 
     @cached_property
-    def _draw_gaussians(self) -> "Renderer":
+    def _render_gaussians(self) -> "Renderer":
         from dg4d_lib.rasterizer.interface import get_rasterizer
         from steps.artifacts.rendering import splat_renderer
 
         return splat_renderer(self._states, get_rasterizer("auto"))
 
     @cached_property
-    def _draw_mesh(self) -> "Renderer":
+    def _render_mesh(self) -> "Renderer":
         from steps.artifacts.rendering import mesh_renderer
 
         return mesh_renderer(self._surface)

@@ -45,7 +45,7 @@ PNG_MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "I;16B")  # of PIL imag
 CONVERTED_MODES = {  # PIL modes that PNG does not have, and the one that they become
     "CMYK": "RGB", "YCbCr": "RGB", "LAB": "RGB", "HSV": "RGB", "RGBX": "RGB", "RGBa": "RGBA", "La": "LA", "PA": "RGBA",
 }  # fmt: skip
-ROUNDING = 0.5 / 255  # by which floats may leave [0, 1]: half a step of 8 bits
+ROUNDING = 0.5 / 255  # tolerance of floats outside of [0, 1]: half a step of 8 bits
 FAILURES = (DG4DError, OSError)  # of one item of a batch
 
 

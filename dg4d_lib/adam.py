@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Adam:
-    """The part of `torch.optim.Adam` that the fits use, with the results of its `fused=True`.
+    """Subset of `torch.optim.Adam` that the fits use; results equal those of `fused=True`.
 
     Attributes:
         param_groups: tensors ("params", of one device and precision per group), their learning rate ("lr") and "eps";

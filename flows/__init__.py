@@ -1,1 +1,1 @@
-"""Prefect flows: what runs when, on what, with which retries; imports no torch."""
+"""Prefect flows: order, resources and retries of the steps; imports no torch."""

@@ -24,26 +24,28 @@ class BenchmarkEntry(Frozen):
 
     Attributes:
         name: name of the object.
-        truth: its ground truth.
+        ground_truth: its ground truth.
         package: its asset; None where the conversion failed.
         error: message of that failure.
         kind: name of its exception.
-        seconds: compute time of the conversion.
+        seconds: compute time of the conversion, as far as the scores need it.
+        max_frames: number of frames that its video was sampled to, at most; 0 if it follows no video.
     """
 
     name: str
-    truth: ArtifactRef
+    ground_truth: ArtifactRef
     package: ArtifactRef | None = None
     error: str = ""
     kind: str = ""
     seconds: float = 0.0
+    max_frames: int = 0
 
 
 class BenchmarkResult(Frozen):
-    """Scores of all objects, and the films of each: of the ground truth and of the asset."""
+    """Scores of all objects, and the videos of each: of the ground truth and of the asset."""
 
     results: Results
-    films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]]
+    videos: dict[str, dict[Literal["truth", "ours"], ArtifactRef]]
 
 
 @flow(name="score-assets", flow_run_name="{title}", persist_result=False)
@@ -52,7 +54,7 @@ def score_assets(
 ) -> BenchmarkResult:
     """Score every asset, and naive baselines beside it; an object that fails does not stop the others."""
     objects: list[ObjectScores] = []
-    films: dict[str, dict[Literal["truth", "ours"], ArtifactRef]] = {}
+    videos: dict[str, dict[Literal["truth", "ours"], ArtifactRef]] = {}
     missing: dict[str, str] = {}
     clips: dict[str, list[list[float]]] = {"truth": [], "ours": []}
     store = home.store()
@@ -62,13 +64,16 @@ def score_assets(
             # score_asset reads the settings given here; those of the conversion do not count
             conversion = Conversion(item=entry.name, settings=PREVIEW, seed=seed)
             try:
-                baselines = score_asset(entry.truth, settings.model_copy(update={"mesh": False}), conversion).outputs
-                asset = score_asset(entry.truth, settings, conversion, entry.package).outputs
+                baselines = score_asset(
+                    entry.ground_truth, settings.model_copy(update={"mesh": False}), conversion
+                ).outputs
+                sampled = settings.model_copy(update={"max_frames": entry.max_frames})
+                asset = score_asset(entry.ground_truth, sampled, conversion, entry.package).outputs
             except StepError as error:
                 one = one.model_copy(update={"error": error.message, "kind": type(error).__name__})
             else:
                 theirs, mine = store.load_json(baselines["scores"]), store.load_json(asset["scores"])
-                films[entry.name] = {"truth": baselines["films"], "ours": asset["films"]}
+                videos[entry.name] = {"truth": baselines["films"], "ours": asset["films"]}
                 missing |= mine["missing"]
                 clips["truth"] += theirs["clips"].values()
                 clips["ours"] += mine["clips"].values()
@@ -89,15 +94,15 @@ def score_assets(
         missing=missing | without_fvd,
     )
     create_table_artifact(table=scores.table(results), key="benchmark", description=markdown(title))
-    return BenchmarkResult(results=results, films=films)
+    return BenchmarkResult(results=results, videos=videos)
 
 
 def _fvd(clips: dict[str, list[list[float]]], missing: str) -> tuple[scores.Figures, dict[str, str]]:
-    """Return the FVD between all films of the assets and all of the ground truth, or the reason why there is none.
+    """Return the FVD between all videos of the assets and all of the ground truth, or the reason why it is missing.
 
     Args:
-        clips: I3D features of the films.
-        missing: reason why no film has features.
+        clips: I3D features of the videos.
+        missing: reason why no video has features.
     """
     if not clips["ours"]:
         return {}, {FVD: missing} if missing else {}

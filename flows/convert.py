@@ -169,14 +169,16 @@ def run_flow(
     from flows.engine.resources import slots
     from flows.ui.showing import run_again
 
-    flow = pipeline.text_to_4d if job.drawn else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
+    flow = (
+        pipeline.text_to_4d if job.generates_picture else pipeline.video_to_4d if job.moving else pipeline.image_to_4d
+    )
     runner: Any = ThreadPoolTaskRunner(max_workers=slots())
     with _flow_context(job, {PREFECT_TASKS_REFRESH_CACHE: refresh}):
         return run_again(lambda: flow.with_options(task_runner=runner)(job, folder, mesh_parts))
 
 
 def rank_motions(job: ConversionJob, folder: Path) -> dict[str, Any]:
-    """Generate and rank motions of a job's picture, write sheet, ranking and films into `folder`; return the ranking.
+    """Generate and rank motions of a job's picture, write sheet, ranking and videos into `folder`; return the ranking.
 
     Raises:
         StepError: a step failed.

@@ -46,7 +46,7 @@ from steps.contract import LARGEST_SEED, ArtifactRef, Frozen
 from steps.profiles import ProfileName, profile, revise
 
 WHERE = r"^(|local|dask|deployment(:[\w .-]+)?)$"  # no address of a Dask scheduler, which runs code
-MOST_STARTS = 3  # of a run whose process dies
+MOST_STARTS = 3  # starts of a run whose process dies
 
 
 def _title(text: str) -> dict[str, Any]:
@@ -305,7 +305,7 @@ def catalog_to_4d(
     )
     rows = batch(request, console(), allow=roots.check_item)
     failed = print_summary(rows, folder, console())
-    text = f"{sum(row.made for row in rows)} of {len(rows)} items are in {folder}"
+    text = f"{sum(row.has_package for row in rows)} of {len(rows)} items are in {folder}"
     return Failed(message=text) if failed else Completed(message=text)
 
 

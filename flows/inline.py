@@ -36,7 +36,7 @@ from steps.contract import StepRequest, StepResult
 from steps.store.artifact_store import StoreUnreachable
 from steps.store.files import home as store_home
 
-STOP_POLL_S = 0.5  # between two looks for a stop while another process computes the same step
+STOP_POLL_S = 0.5  # between two checks for a stop while another process computes the same step
 
 P = ParamSpec("P")
 R = TypeVar("R", bound=StepResult)

@@ -63,7 +63,7 @@ def locked(path: Path, *, shared: bool = False, patience_s: float = 0.0) -> Iter
     Args:
         path: path of the file; created if missing.
         shared: take a shared lock, to see if another process holds an exclusive one.
-        patience_s: seconds to retry, since those who look hold a shared lock for a moment.
+        patience_s: seconds to retry, since readers hold a shared lock briefly.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     deadline = time.monotonic() + patience_s
@@ -100,7 +100,7 @@ def spawn_guard(module: str, arguments: Sequence[str], log: Path, mode: str, env
             cwd=log.parent,
             env=env,
             start_new_session=True,
-            umask=0o077,  # database and logs contain what users asked for
+            umask=0o077,  # database and logs contain user input
             check=False,
         )
 
@@ -126,7 +126,7 @@ OWN_START = start_of(os.getpid())
 
 @contextmanager
 def repeated(number: signal.Signals) -> Iterator[None]:
-    """Send a signal again until the block has ended: what its handler raises may be lost, see `start_reminder`.
+    """Repeat a signal until the block has ended, since the exception of its handler may be lost; see `start_reminder`.
 
     Outside of the main thread, and for signals without a handler, nothing changes.
     """

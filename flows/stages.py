@@ -36,11 +36,11 @@ class StepTask(Protocol[P, R_co]):
         """Run the task in this thread."""
 
     def submit(self, *args: P.args, **kwargs: P.kwargs) -> StepFuture[R_co]:
-        """Run the task beside this thread."""
+        """Run the task in another thread."""
 
 
 class Bind(Protocol):
-    """Function that makes the call of a step a task of an engine."""
+    """Function that wraps the call of a step in a task of an engine."""
 
     def __call__(self, call: Callable[P, R]) -> StepTask[P, R]:
         """Return the task."""
@@ -50,7 +50,7 @@ class Tasks:
     """Tasks of one engine.
 
     Args:
-        bind: makes the call of a step a task.
+        bind: wraps the call of a step in a task.
         finished: returns the step runs of the current conversion so far, in the order of the catalog.
     """
 
@@ -87,14 +87,14 @@ def conversion_of(job: ConversionJob, mesh_parts: int = 0) -> Conversion:
 
 def planned_steps(job: ConversionJob) -> list[str]:
     """Return the names of the steps that a job certainly runs, in the order in which they usually end."""
-    first = ["draw_picture"] if job.drawn else []
+    first = ["draw_picture"] if job.generates_picture else []
     refined = ["refine_texture"] if job.settings.refiner.kind != "identity" else []
     fits = ["drive_video", "fit_gaussians", "fit_motion", "plan_mesh", "extract_mesh"]
     if job.asset is not None:  # splats go on to `plan_mesh` and `extract_mesh`
         own = ["prepare_asset"] if job.asset == job.source else ["prepare_subject", "prepare_asset"]
         return [*own, "drive_video", "animate_asset", *refined, "pack_asset", "check_asset"]
-    drawn = job.settings.views.kind != "none"
-    sides = ["prepare_views"] if job.views is not None else ["generate_views"] if drawn else []
+    generates_views = job.settings.views.kind != "none"
+    sides = ["prepare_views"] if job.views is not None else ["generate_views"] if generates_views else []
     return [*first, "prepare_subject", *sides, *fits, *refined, "pack_asset", "check_asset"]
 
 
@@ -113,7 +113,7 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
     if job.asset is not None and job.asset == job.source:  # no picture: the model's own render is set in motion
         model = tasks.prepare_asset(job.asset, conversion)
         return animate(model, job.source, job, conversion, tasks, model)
-    source = tasks.draw_picture(job.source, conversion).picture if job.drawn else job.source
+    source = tasks.draw_picture(job.source, conversion).picture if job.generates_picture else job.source
     subject = tasks.prepare_subject(source, conversion, job.mask, job.depth, job.layers)
     if must_move and subject.footage is None:
         raise StepBadInput("prepare_subject", _is_no_video(job.source_name))
@@ -121,7 +121,7 @@ def convert(job: ConversionJob, conversion: Conversion, tasks: Tasks, must_move:
 
 
 def _is_no_video(name: str) -> str:
-    """Return the message for a single picture, by its file name, where a video was asked for."""
+    """Return the error message for a single picture, by its file name, in place of a video."""
     if Path(name).suffix.lower() in ALWAYS_MOVING:
         return "this video holds a single picture, and a video has two frames or more; give a longer one"
     return (
@@ -148,17 +148,17 @@ def animate(
         tasks: tasks of the engine.
         model: the user's model, if it has been prepared already.
     """
-    filming = tasks.drive_video.submit(subject, conversion)
+    video_task = tasks.drive_video.submit(subject, conversion)
     gaussians: Gaussians | Asset
     known = None
     if job.asset is not None:
         gaussians = model or tasks.prepare_asset(job.asset, conversion, subject)
-        driving_video = filming.result()
+        driving_video = video_task.result()
         motion = tasks.animate_asset(gaussians, driving_video, conversion)
     else:
         known = known_views(subject, source, job, conversion, tasks)
         gaussians = tasks.fit_gaussians(subject, conversion, job.bank, known)  # here, parallel to the driving video
-        driving_video = filming.result()
+        driving_video = video_task.result()
         motion = tasks.fit_motion(subject, gaussians, driving_video, conversion, job.bank, known)
     if "tracked" in motion.outputs:  # the mesh of the user's model
         mesh = Mesh.model_validate(motion.model_dump())
@@ -167,7 +167,7 @@ def animate(
         guessed = subject if fitted and known is None and job.settings.prior.kind == "learned" else None
         mesh = mesh_over_time(gaussians, motion, driving_video, conversion, tasks, fitted, guessed)
     if job.settings.refiner.kind != "identity":
-        mesh = tasks.refine_texture(mesh, driving_video, conversion)
+        mesh = tasks.refine_texture(subject, mesh, driving_video, conversion)
     notes = notes_of(done.result for done in tasks.finished())
     package = tasks.pack_asset(subject, driving_video, gaussians, motion, mesh, notes, conversion)
     return Converted(package, tasks.check_asset(package, driving_video, subject, conversion))
@@ -199,7 +199,7 @@ def mesh_over_time(
         driving_video: frames that the motion was fitted to.
         conversion: parameters that all steps share.
         tasks: tasks of the engine.
-        fitted: the cloud was fitted to the video too, so that a mesh may follow the video and has its colors; not
+        fitted: the cloud was fitted to the video, so that a mesh may follow the video and takes its colors; not
             splats of the user's.
         guessed: subject whose shape the learned prior has guessed from its picture alone.
     """

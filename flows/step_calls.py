@@ -10,7 +10,7 @@ from steps.profiles import ScoreAssetSettings
 
 
 class Picture(StepResult):
-    """Picture that a model drew from words."""
+    """Picture that a text-to-image model generated."""
 
     @property
     def picture(self) -> ArtifactRef:
@@ -36,7 +36,7 @@ class KnownViews(StepResult):
 
 
 class DrivingVideo(StepResult):
-    """Driving video; with contact sheet, ranking and films if it was selected among candidates."""
+    """Driving video; with contact sheet, ranking and videos if it was selected among candidates."""
 
     @property
     def frames(self) -> ArtifactRef:
@@ -157,7 +157,7 @@ def plan_mesh(
 ) -> Plan:
     """Decide whether one mesh can follow the motion or every frame needs its own.
 
-    With the subject, the shape of one mesh will be what the shape network says of it.
+    With the subject, the shape of one mesh is predicted by the shape network.
     """
     return run_step("plan_mesh", Plan, **locals())
 
@@ -174,7 +174,7 @@ def extract_mesh(
     """Extract one mesh that follows the motion, or a mesh per frame of a part of the frames.
 
     Textures take their colors from the driving video, if it is given, where it shows the surface. With the subject, the
-    shape of one mesh is what the shape network says of it. A tracked mesh that loses the video may be given up for the
+    shape of one mesh is predicted by the shape network. A tracked mesh that loses the video may be given up for the
     plan of a mesh per frame.
     """
     return run_step("extract_mesh", Mesh, **locals())
@@ -185,8 +185,8 @@ def join_meshes(parts: list[Mesh], conversion: Conversion) -> Mesh:
     return run_step("join_meshes", Mesh, **locals())
 
 
-def refine_texture(mesh: Mesh, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
-    """Refine the textures with a video-to-video diffusion model."""
+def refine_texture(subject: Subject, mesh: Mesh, driving_video: DrivingVideo, conversion: Conversion) -> Mesh:
+    """Refine the textures with a video-to-video diffusion model, conditioned on the subject."""
     return run_step("refine_texture", Mesh, **locals())
 
 

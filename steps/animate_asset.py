@@ -16,7 +16,7 @@ from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.fitting.asset_motion import fit_asset_motion, iterations
 from dg4d_lib.fitting.asset_pose import Placement
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.fitting.rigid_parts import keep_pieces_whole
+from dg4d_lib.fitting.rigid_parts import keep_pieces_rigid
 from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion, skeleton_iterations
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.merging import merge_gaussians
@@ -76,7 +76,7 @@ def run(job: Job) -> StepReport:
         # covered in its own coordinates, as in prepare_asset: rows of `nearest` are rows of the Gaussians
         covered = cover_surface(glb.model, settings.points, torch.Generator().manual_seed(job.seed))
         surface = covered.placed(placement.quat, placement.scale, placement.shift)
-        mesh = controlled(glb, placement, surface, settings)
+        mesh = attach_controls(glb, placement, surface, settings)
         graph = mesh.graph.of(surface.nearest)
         fitted, bound = cloud, graph
     else:
@@ -105,8 +105,10 @@ def run(job: Job) -> StepReport:
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
-def controlled(glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, settings: AssetSettings) -> PlacedMesh:
-    """Return a mesh that its joints move where it was posed by them, and control nodes on its surface elsewhere."""
+def attach_controls(
+    glb: ForeignGlb, placement: Placement, surface: SurfaceCloud, settings: AssetSettings
+) -> PlacedMesh:
+    """Return a mesh controlled by its joints if it was posed by them, else by control nodes on its surface."""
     skeleton = read_skeleton(glb) if placement.posed else None
     if skeleton is None:
         control = build_control_graph(surface.fine.vertices, surface.fine.faces, settings.nodes)
@@ -131,7 +133,7 @@ def motion_note(motion: NodeMotion, most_parts: int) -> str:
 def moving_graph(
     graph: ControlGraph, motion: NodeMotion, most_parts: int, faces: Int[np.ndarray, "f 3"]
 ) -> ControlGraph:
-    """Return the graph by which a motion moves a surface: pieces stay whole if it is a motion of few rigid parts.
+    """Return the graph that skins a surface to a motion: pieces stay rigid if the motion has few rigid parts.
 
     Args:
         graph: of the vertices.
@@ -143,7 +145,7 @@ def moving_graph(
     if int(parts.max()) >= most_parts:
         return graph
     pieces = connected_parts(edge_graph(faces, count), np.arange(count))
-    return keep_pieces_whole(graph, parts, torch.from_numpy(pieces).long())
+    return keep_pieces_rigid(graph, parts, torch.from_numpy(pieces).long())
 
 
 def moved_states(cloud: Gaussians, graph: ControlGraph, motion: NodeMotion) -> Gaussians:
@@ -210,5 +212,5 @@ def _write_mesh(job: Job, mesh: PlacedMesh, motion: NodeMotion, fps: float, note
 def _picture(states: Gaussians, rasterize: Rasterizer) -> Float[Tensor, "h w 3"]:
     """Render some frames from the front and from the side."""
     frames = torch.linspace(0, len(states.means) - 1, min(PICTURE_FRAMES, len(states.means))).round().long()
-    chosen = states.states(frames)
-    return torch.cat([render_row(chosen, [azimuth] * len(frames), rasterize) for azimuth in (0.0, 90.0)])
+    selected = states.states(frames)
+    return torch.cat([render_row(selected, [azimuth] * len(frames), rasterize) for azimuth in (0.0, 90.0)])

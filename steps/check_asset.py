@@ -26,8 +26,9 @@ from dg4d_lib.video.driving import DrivingVideo
 from steps.artifacts.archives import unpack
 from steps.artifacts.gates import gates_as_json, read_rows, write_gates
 from steps.artifacts.media import read_frames, read_png, write_png
-from steps.artifacts.packages import ASSET, COMPACT, MANIFEST, MERGED, MESHES, read_manifest
-from steps.artifacts.packages import SPLATS as SPLATS_FOLDER
+from steps.artifacts.package_files import ASSET, COMPACT, MANIFEST, MERGED, MESHES
+from steps.artifacts.package_files import SPLATS as SPLATS_FOLDER
+from steps.artifacts.packages import read_manifest
 from steps.artifacts.rendering import BATCH, States, mesh_at, mesh_renderer, read_states, read_surface
 from steps.runtime.job import Job, StepReport
 
@@ -115,13 +116,13 @@ def collect_evidence(
 
     def splats(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 5"]:
         with torch.no_grad():
-            drawn = rasterizer(asset.states(positions), cameras, torch.ones(3))
-        depth = drawn.depth / drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
-        return torch.cat([drawn.color, drawn.alpha, depth], -1)
+            rendering = rasterizer(asset.states(positions), cameras, torch.ones(3))
+        depth = rendering.depth / rendering.alpha.clamp_min(torch.finfo(rendering.alpha.dtype).tiny)
+        return torch.cat([rendering.color, rendering.alpha, depth], -1)
 
     def triangles(positions: Float[Tensor, " b"], cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s 4"]:
-        drawn = mesh(positions, cameras)
-        color, alpha = drawn[..., :3], drawn[..., 3:]
+        rendering = mesh(positions, cameras)
+        color, alpha = rendering[..., :3], rendering[..., 3:]
         return torch.cat([color_over_white(color, alpha), alpha], -1)
 
     seen, around = {}, {}
@@ -129,7 +130,7 @@ def collect_evidence(
         finer = SUPERSAMPLE if form == SPLATS else 1
         seen[form] = _pictures(draw, positions, [front] * len(positions), finer)
         around[form] = _pictures(draw, timestamps.repeat_interleave(len(sides)), sides * len(timestamps), finer)
-    turn = _drawn(splats, positions[:1].repeat(TURN), ring)
+    turn = _render(splats, positions[:1].repeat(TURN), ring)
     flaws, folds = _worst_defects(asset, timestamps)
     return GateInputs(
         picture=_resized(cutout[None]),
@@ -170,7 +171,7 @@ def _spread(count: int, most: int) -> Float[Tensor, " n"]:
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
 
 
-def _drawn(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s c"]:
+def _render(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b s s c"]:
     parts = [slice(start, start + BATCH) for start in range(0, len(cameras), BATCH)]
     return torch.cat([draw(positions[part], cameras[part]) for part in parts])
 
@@ -179,8 +180,8 @@ def _pictures(draw: DrawAt, positions: Tensor, cameras: Sequence[OrbitCamera], f
     """Render an asset at a multiple of the resolution, then reduce the pictures to the size of the cameras."""
     size = (cameras[0].height, cameras[0].width)
     fine = [replace(camera, width=finer * camera.width, height=finer * camera.height) for camera in cameras]
-    drawn = resize(_drawn(draw, positions, fine)[..., :4], size)
-    return RgbaImages(drawn[..., :3].clamp(0, 1).contiguous(), drawn[..., 3:4].clamp(0, 1).contiguous())
+    rendering = resize(_render(draw, positions, fine)[..., :4], size)
+    return RgbaImages(rendering[..., :3].clamp(0, 1).contiguous(), rendering[..., 3:4].clamp(0, 1).contiguous())
 
 
 def _resized(cutouts: Float[Tensor, "b h w 4"]) -> RgbaImages:

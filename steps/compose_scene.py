@@ -19,10 +19,11 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import concatenate, transform
 from dg4d_lib.rasterizer.interface import get_rasterizer
-from steps.artifacts.packages import ASSET, COMPACT, MERGED, USD, read_file, read_manifest
+from steps.artifacts.package_files import ASSET, COMPACT, MERGED, USD
+from steps.artifacts.packages import read_file, read_manifest
 from steps.artifacts.rendering import fitted_positions
 
-FILM_SIZE = 384  # pixels of a side
+PREVIEW_SIZE = 384  # side of the preview video, pixels
 MOST_PICTURES = 300  # of a preview video; all are in memory until it is written
 SWING_DEG = 25.0  # amplitude of the camera's azimuth
 ELEVATION_DEG = 10.0  # of the camera
@@ -46,9 +47,9 @@ class SceneWriter:
 
     def __init__(self, folders: Sequence[Path], items: Sequence[SceneItem], names: Sequence[str]) -> None:
         self.folders = list(folders)
-        bodies = {folder: _body(folder) for folder in dict.fromkeys(folders)}
+        glbs = {folder: _read_glb(folder) for folder in dict.fromkeys(folders)}
         self.actors = [
-            Actor(name, bodies[folder], item) for name, folder, item in zip(names, folders, items, strict=True)
+            Actor(name, glbs[folder], item) for name, folder, item in zip(names, folders, items, strict=True)
         ]
 
     def in_a_row(self, spacing: float) -> None:
@@ -120,13 +121,13 @@ class SceneWriter:
         clouds = {folder: _MovingGaussians(folder) for folder in dict.fromkeys(self.folders)}
         center, radius = self._bounding_sphere()
         scale = FILLED * RADIUS * math.sin(math.radians(FOV_Y_DEG / 2)) / radius
-        background, pictures = studio_background(FILM_SIZE), []
+        background, pictures = studio_background(PREVIEW_SIZE), []
         for start in range(0, count, BATCH):
             frames = torch.arange(start, min(start + BATCH, count), dtype=torch.float64)
             pairs = zip(self.actors, self.folders, strict=True)
             states = concatenate([clouds[folder].at(actor, frames / scene.fps) for actor, folder in pairs])
             azimuths = [SWING_DEG * math.sin(2 * math.pi * frame / count) for frame in frames.tolist()]
-            cameras = [OrbitCamera(ELEVATION_DEG, each, width=FILM_SIZE, height=FILM_SIZE) for each in azimuths]
+            cameras = [OrbitCamera(ELEVATION_DEG, each, width=PREVIEW_SIZE, height=PREVIEW_SIZE) for each in azimuths]
             centered = transform(states, IDENTITY_QUAT, scale, -scale * center)
             pictures.append(render_over(background, centered, cameras, draw))
             progress(start + len(frames), count)
@@ -163,7 +164,7 @@ class _MovingGaussians:
         return transform(states, quat, actor.item.scale, torch.from_numpy(actor.origin))
 
 
-def _body(folder: Path) -> AnimatedGlb:
+def _read_glb(folder: Path) -> AnimatedGlb:
     manifest = read_manifest(folder)
     name = MERGED if manifest.mode == "own" else ASSET
     content = read_file(folder, name)

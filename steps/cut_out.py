@@ -1,4 +1,4 @@
-"""Step that cuts the subject out of the first frame of a source, small and quick, to be looked at and corrected."""
+"""Step that cuts the subject out of the first frame of a source at low resolution, for inspection and correction."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ from steps.sources.networks import open_network
 from steps.sources.reader import Source, read_source
 
 LONGEST = 768  # pixels of the longer side; `prepare_subject` estimates at up to twice `subject.size`
-FEWEST_FRAMES = 2  # that can be read of a video
+FEWEST_FRAMES = 2  # least number of frames that the video reader keeps
 
 
 def run(job: Job) -> StepReport:

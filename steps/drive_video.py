@@ -31,7 +31,7 @@ from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import license_note, offload_notes, open_weights
 
 TILE, COLUMNS = 160, 7  # pixels of a tile, and frames, in the contact sheets
-FILM = 256  # pixels of a side of the films
+VIDEO_SIZE = 256  # side of the candidates' videos, pixels
 WHITE = torch.ones(3)
 
 
@@ -151,7 +151,7 @@ def _pipeline_videos(
 def _rank_candidates(
     job: Job, subject: Float[Tensor, "h w 4"], motions: Sequence[_Motion]
 ) -> tuple[_Motion, tuple[str, ...]]:
-    """Return the best motion with a note; write the contact sheet, the ranking and the films."""
+    """Return the best motion with a note; write the contact sheet, the ranking and the videos."""
     scored = []
     for done, motion in enumerate(motions, 1):
         scored.append(Candidate(motion.number, motion.name, motion.video, score_video(motion.video, subject)))
@@ -161,7 +161,7 @@ def _rank_candidates(
     write_png(job.outputs["candidates"], draw_video_sheet([each.video for each in order], names, TILE, COLUMNS))
     table = {"weights": WEIGHTS, "taken": order[0].number, "candidates": [each.row() for each in order]}
     job.outputs["ranking"].write_text(json.dumps(table, indent=2), encoding="utf-8")
-    _write_films(job.outputs["films"], scored)
+    _write_videos(job.outputs["films"], scored)
     best = next(motion for motion in motions if motion.number == order[0].number)
     note = (
         f"Motion {best.number} is the best of {len(motions)} by its score; `dg4d motions` shows all, --pick K takes K."
@@ -169,11 +169,11 @@ def _rank_candidates(
     return best, (note,)
 
 
-def _write_films(path: Path, candidates: Sequence[Candidate]) -> None:
+def _write_videos(path: Path, candidates: Sequence[Candidate]) -> None:
     entries = []
     scratch = path.with_suffix(".mp4")
     for each in candidates:
-        small = resize(each.video.over(WHITE), (FILM, FILM)).clamp(0, 1)
+        small = resize(each.video.over(WHITE), (VIDEO_SIZE, VIDEO_SIZE)).clamp(0, 1)
         write_mp4(scratch, small, each.video.fps)
         entries.append((f"{each.number}.mp4", scratch.read_bytes()))
     scratch.unlink()

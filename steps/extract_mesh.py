@@ -35,7 +35,7 @@ from dg4d_lib.mesh.extraction.unfold import unfold
 from dg4d_lib.mesh.fairing import fair
 from dg4d_lib.mesh.render import render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
-from dg4d_lib.mesh.texturing.bake import Draw, drawn_gaussians
+from dg4d_lib.mesh.texturing.bake import Draw, gaussian_renderer
 from dg4d_lib.mesh.texturing.chart_packing import QUICK
 from dg4d_lib.mesh.texturing.footage import fit_texture
 from dg4d_lib.mesh.tracking.color_registration import register_to_colors
@@ -75,7 +75,7 @@ from steps.runtime.job import Job, StepReport
 Surface = tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]
 Textured = Callable[[TexturedMesh, Float[Tensor, "t v 3"]], TexturedMesh]  # gives a mesh its texture, by its positions
 
-LOST_DB, LOST_SHARE = 8.0, 1 / 8  # of PSNR by which a frame is lost, and the largest share of such frames
+LOST_DB, LOST_SHARE = 8.0, 1 / 8  # loss of PSNR from which a frame counts as lost, and the largest share of such frames
 CLOSE_ERROR = 1e-3  # squared error below which Gaussians are not closer to the video, 30 dB
 FOLLOWED = {"gaussians": "motion", "video": "driving video"}
 OUTLINES = {"gaussians": "the Gaussians'", "video": "those of video and Gaussians"}
@@ -89,7 +89,7 @@ class RestShape(NamedTuple):
         vertices: in the reference frame, world units, not split along seams.
         faces: counter-clockwise seen from outside.
         gaussians: in the reference frame.
-        draw: renders what the surface was made of.
+        draw: renders the Gaussians or the shapes that the surface was extracted from.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -113,7 +113,7 @@ class Candidate(NamedTuple):
 
 
 def run(job: Job) -> StepReport:
-    """Extract the tracked mesh, or the meshes of frames `first_frame` to `end_frame`, as the plan says.
+    """Extract the tracked mesh, or the meshes of frames `first_frame` to `end_frame`, according to the plan.
 
     In mode `auto`, a tracked mesh that loses the video is not written, but the plan of a mesh per frame is.
 
@@ -199,7 +199,7 @@ def textured_mesh(
         vertices, faces = with_strands(vertices, faces, alpha)
         vertices = vertices + fit_outline_detail(vertices, torch.zeros_like(vertices)[None], faces, alpha[None])[0]
     shown = shown_by(vertices, faces, frame)
-    mesh, sources = colored(vertices, faces, drawn_gaussians(gaussians, rasterize), settings, shown, QUICK)
+    mesh, sources = colored(vertices, faces, gaussian_renderer(gaussians, rasterize), settings, shown, QUICK)
     return replace(mesh, texture=fit_texture(mesh, shown(sources)))
 
 
@@ -222,11 +222,11 @@ def _rest_shape(
     guesses: SubjectShapes | None,
     frame: int,
 ) -> RestShape:
-    """Return the guess of a frame, or without guesses the isosurface of the Gaussians."""
+    """Return the predicted surface of a frame, or without predictions the isosurface of the Gaussians."""
     gaussians = states.at(frame)
     if guesses is None:
         vertices, faces = _isosurface(gaussians, level, rasterize, settings)
-        draw = drawn_gaussians(gaussians, rasterize)
+        draw = gaussian_renderer(gaussians, rasterize)
     else:
         guess, unit = guesses.surface(frame), density_field(gaussians, settings).unit
         rough = clean(guess.vertices.double().numpy(), guess.faces.numpy(), settings, unit)
@@ -253,7 +253,7 @@ def _tracked(
         skinned = skin_vertices(vertices, rest.gaussians, relative_to_frame(displacement, frame))
         projected = project_to_isosurface(vertices, skinned, faces, states, level, settings)
         silhouettes = render_silhouettes(states, range(len(projected)), rasterize)
-        registered, _ = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
+        registered = register_nonrigid(vertices, projected, faces, states, silhouettes, level, settings)
         relaxed = relax(vertices, registered, faces, silhouettes)
         mesh, sources = coloring.result()
     strands: tuple[Tube, ...] = ()
@@ -323,7 +323,7 @@ def _guided(
 
 
 def _trial_note(plan: MeshPlan) -> str:
-    """Return a note with the agreement of the trial mesh that the reference frame was chosen by."""
+    """Return a note with the IoU of the trial mesh by which the reference frame was selected."""
     return f"trial mesh of frame {plan.reference_frame}: {plan.followed:.1%} silhouette IoU over the motion"
 
 
@@ -389,14 +389,14 @@ def _registered(
 
 
 def _lost_frames(tracked: TrackedMesh, states: Gaussians, video: DrivingVideo, rasterize: Rasterizer) -> int:
-    """Count the frames that the Gaussians show closer by `LOST_DB` or more than the mesh does, at the input view."""
+    """Count the frames where the mesh's PSNR is `LOST_DB` or more below that of the Gaussians, at the input view."""
     size = video.frames.shape[1]
     camera, white, lost = OrbitCamera(width=size, height=size), torch.ones(3), 0
     moved = tracked.mesh.vertices + tracked.offsets
     for frame, shown in enumerate(zip(video.frames, video.alpha, strict=True)):
         with torch.no_grad():
-            drawn = rasterize(states.at(frame), [camera], white).color[0]
-        best = max(float((drawn - color_over_white(*shown)).square().mean()), CLOSE_ERROR)
+            color = rasterize(states.at(frame), [camera], white).color[0]
+        best = max(float((color - color_over_white(*shown)).square().mean()), CLOSE_ERROR)
         lost += squared_error(tracked.mesh, moved[frame], shown) > best * 10 ** (LOST_DB / 10)
     return lost
 

@@ -47,23 +47,23 @@ def run(job: Job) -> StepReport:
     if isinstance(static.start, LgmStartSettings):  # before the prior, so that two networks are not in memory at once
         reconstruction = reconstruct_subject(subject.to(device), static.start, rasterize, generator)
         static = fine_tuning_settings(static)
-    chosen = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, hint, known)
+    step_prior = make_prior(prior, [subject], static, job.inputs.get("bank"), job.pictures, hint, known)
     others = known_views(known) if known is not None else []
     if reconstruction:
         start = reconstruction.gaussians
     else:
-        shapes = chosen.shapes or subject_shapes(prior, [subject], hint, known)
+        shapes = step_prior.shapes or subject_shapes(prior, [subject], hint, known)
         start = initial_gaussians(job.settings.static.start, shapes, generator).to(device)
     curves = LossCurves(static.iterations, job.progress)
 
     def watch(now: Gaussians) -> None:
         show_fit(job, now.detach, rasterize)
 
-    with picture_of_divergence(job, rasterize), chosen.threads():
+    with picture_of_divergence(job, rasterize), step_prior.threads():
         gaussians = fit_gaussians(
-            start, subject, chosen.prior, rasterize, static, generator, curves.add, known=others, watch=watch
+            start, subject, step_prior.prior, rasterize, static, generator, curves.add, known=others, watch=watch
         )
-    report = chosen.report(f"{backend} rasterizer")
+    report = step_prior.report(f"{backend} rasterizer")
     report = reconstruction.add_to(report) if reconstruction else report
     write_ply(job.outputs["gaussians"], gaussians)
     job.outputs["first_look"].write_bytes(write_web_splats(one_state(gaussians), fps=1))

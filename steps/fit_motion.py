@@ -21,7 +21,7 @@ from steps.runtime.job import Job, StepReport
 STRAYS = "Stray Gaussians that separated from the moving subject were removed: {}."
 FINE_TUNED = "The canonical Gaussians were optimized together with the deformation, on all frames."
 PICTURE_FRAMES = 6
-STATES = 16  # at once in the memory, where strays are searched
+STATES = 16  # states in memory at once during the search for strays
 FRONT_DEG, SIDE_DEG = 0.0, 90.0
 
 
@@ -45,35 +45,35 @@ def run(job: Job) -> StepReport:
     if tracked:
         track = SurfaceTracker(gaussians, video, tracked, rasterize, generator, settings.trackings, curves.add)
     with picture_of_divergence(job, rasterize):
-        chosen = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, track)
+        step_prior = make_prior(prior, cutouts, settings, job.inputs.get("bank"), job.pictures, hint, known, track)
     field = new_deformation(kind, gaussians, len(video), generator)
     deformation = track.hinged.carrying(field, gaussians) if track and track.hinged else field
     device = preferred_device(backend)
     deformation.to(device)
     start = gaussians.to(device)
-    moments = torch.linspace(0, 1, len(SHOWN_AZIMUTHS_DEG) + 1)[:-1].to(device)  # one for each side
+    shown_times = torch.linspace(0, 1, len(SHOWN_AZIMUTHS_DEG) + 1)[:-1].to(device)  # one for each side
 
     def watch(iteration: int, values: dict[str, float]) -> None:
         curves.add(before + iteration, values)
-        show_fit(job, lambda: deformation.displace(start.means, moments).apply(start), rasterize)
+        show_fit(job, lambda: deformation.displace(start.means, shown_times).apply(start), rasterize)
 
-    with picture_of_divergence(job, rasterize), chosen.threads():
+    with picture_of_divergence(job, rasterize), step_prior.threads():
         others = still_views(known, len(video))
         fitted = fit_motion(
-            start, deformation, video, chosen.prior, rasterize, settings, generator, watch, known=others
+            start, deformation, video, step_prior.prior, rasterize, settings, generator, watch, known=others
         )
     deformation.cpu()
     gaussians, deformation, strays = _without_strays(fitted.to(torch.device("cpu")), deformation, len(video))
     if settings.fine_tune or strays:
         write_ply(job.outputs["gaussians"], gaussians)
     write_motion(job.outputs["motion"], deformation, kind, len(video), len(gaussians))
-    curves.write(job.outputs["curves"], "motion fit", [chosen.note])
+    curves.write(job.outputs["curves"], "motion fit", [step_prior.note])
     timestamps = torch.linspace(0, 1, min(PICTURE_FRAMES, len(video)))
     with torch.no_grad():
         states = deformation.displace(gaussians.means, timestamps).apply(gaussians)
     rows = [render_row(states, [azimuth] * len(timestamps), rasterize) for azimuth in (FRONT_DEG, SIDE_DEG)]
     write_png(job.outputs["picture"], torch.cat(rows))
-    report = chosen.report(f"{backend} rasterizer")
+    report = step_prior.report(f"{backend} rasterizer")
     told = ((tracked, TRACKED_NOTE), (strays, STRAYS.format(strays)), (settings.fine_tune, FINE_TUNED))
     return replace(report, notes=(*report.notes, *(note for happened, note in told if happened)))
 

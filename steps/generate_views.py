@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.diffusion.components import default_device
-from dg4d_lib.diffusion.view_drawing import DrawnDirection, ViewDrawer, directions_of
+from dg4d_lib.diffusion.view_generation import ViewDirection, ViewGenerator, directions_of
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import over_white
 from dg4d_lib.input_settings import ImageEditViewsSettings, NoViewsSettings, SubjectSettings
@@ -24,7 +24,7 @@ from steps.sources.bank_writer import write_bank
 from steps.sources.networks import open_network
 
 INPUT = "the input"
-FADED = 0.85  # of white, over a view of weight 0 in the picture
+FADED = 0.85  # share of white over a view of weight 0 in the picture
 
 
 def run(job: Job) -> StepReport:
@@ -42,10 +42,12 @@ def run(job: Job) -> StepReport:
     device, directions = default_device(), directions_of(settings)
     opened = [open_weights(name) for name in (settings.weights, settings.lora_weights) if name]
     lora = opened[1].folder if settings.lora_weights else None
-    drawer = ViewDrawer.load(opened[0].folder, lora, settings, device)
-    pictures = drawer.draw(over_white(subject), directions, job.seed, lambda done, total: job.progress(done, total, {}))
-    offload = drawer.offload
-    del drawer  # frees memory for the cut-outs
+    generator = ViewGenerator.load(opened[0].folder, lora, settings, device)
+    pictures = generator.generate(
+        over_white(subject), directions, job.seed, lambda done, total: job.progress(done, total, {})
+    )
+    offload = generator.offload
+    del generator  # frees memory for the cut-outs
     network = open_network(job.settings.matting)
     views, notes = cut_views(pictures, directions, subject.shape[0], job.settings.matting, network.segmenter)
     front = known_view(subject, name=INPUT)
@@ -70,7 +72,7 @@ def run(job: Job) -> StepReport:
 
 def cut_views(
     pictures: Sequence[Float[Tensor, "h w 3"]],
-    directions: Sequence[DrawnDirection],
+    directions: Sequence[ViewDirection],
     size: int,
     matting: str,
     segmenter: Segmenter,
@@ -128,7 +130,7 @@ def weighted_views(
 
 
 def judgment_notes(views: Sequence[KnownView], judgments: Sequence[Judgment]) -> tuple[str, ...]:
-    """Return a note that names the views of low weight, with what disagrees."""
+    """Return a note that names the views of low weight and the reasons."""
     low = [
         f"{view.name} ({one.weight:.2f}: {'outline' if one.outline < one.color else 'colors'})"
         for view, one in zip(views, judgments, strict=True)

@@ -25,7 +25,7 @@ from dg4d_lib.assets.formats.splats import write_splat_glb_frames, write_splats,
 from dg4d_lib.assets.formats.spz import scale_notes
 from dg4d_lib.assets.formats.usd import write_skinned_usdz, write_usdz
 from dg4d_lib.assets.formats.web_splats import write_web_splats
-from dg4d_lib.assets.placement import Placement, Surface, place
+from dg4d_lib.assets.placement import Placement, Surface, ground_placement
 from dg4d_lib.assets.rendering.preview import shown_points, write_mp4, write_preview, write_turntable
 from dg4d_lib.assets.rendering.sheet import draw_contact_sheet
 from dg4d_lib.assets.rendering.webp import write_webp
@@ -45,11 +45,11 @@ from dg4d_lib.mesh.textured import TexturedMesh
 from dg4d_lib.mesh.texturing.delight import delight, remove_shading
 from dg4d_lib.rasterizer.interface import Rasterizer, get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts import packages
+from steps.artifacts import package_files
 from steps.artifacts.media import read_frames, write_png, write_zip
 from steps.artifacts.meshes import read_meshes, read_tracked
 from steps.artifacts.motions import read_motion
-from steps.artifacts.packages import MANIFEST, Camera, Manifest, PackagePlacement
+from steps.artifacts.packages import Camera, Manifest, PackagePlacement
 from steps.artifacts.rendering import mesh_at
 from steps.profiles import PackNotes
 from steps.runtime.job import Job, StepReport
@@ -108,16 +108,16 @@ class PackageWriter:
         """Write the animated mesh, and in the mode per_frame also the mesh of every frame."""
         gltf, surface, notes = self.pack.gltf, self.surface, tuple[str, ...]()
         if isinstance(surface, Asset4D):
-            name = packages.ASSET
+            name = package_files.ASSET
             if "moving" in self.inputs:
                 notes = self._write_model(name)
-                name = packages.MERGED
+                name = package_files.MERGED
             content = write_glb(surface, gltf)
             self.path(name).write_bytes(content)
             return notes + component_notes(name, content, self.placement.scale)
-        self.path(packages.ASSET).write_bytes(write_frames_glb(surface, self.fps, _extras(self.notes), gltf))
+        self.path(package_files.ASSET).write_bytes(write_frames_glb(surface, self.fps, _extras(self.notes), gltf))
         for frame, mesh in enumerate(surface):
-            self.path(f"{packages.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
+            self.path(f"{package_files.MESHES}/{frame:03d}.glb").write_bytes(write_mesh_glb(mesh, gltf))
         return ()
 
     def _write_model(self, name: str) -> tuple[str, ...]:
@@ -136,7 +136,7 @@ class PackageWriter:
             return ()
         for level, share in enumerate(self.pack.lods, 1):
             mesh, offsets = simplify_mesh(surface.mesh, surface.offsets, max(1, round(share * len(surface.mesh.faces))))
-            name = f"{packages.LEVELS}/{level}.glb"
+            name = f"{package_files.LEVELS}/{level}.glb"
             self.path(name).write_bytes(write_glb(replace(surface, mesh=mesh, offsets=offsets), self.pack.gltf))
             notes.append(f"{name} has {len(mesh.faces)} of {len(surface.mesh.faces)} triangles")
         return notes
@@ -150,27 +150,27 @@ class PackageWriter:
             notes = (note,)
         if isinstance(surface, Asset4D) and rig is not None:
             precise = rig.rms <= PRECISE * self.placement.scale
-            path = self.path(packages.RIGGED if precise else packages.PLAYBACK)
+            path = self.path(package_files.RIGGED if precise else package_files.PLAYBACK)
             path.write_bytes(write_rigged_glb(surface, rig, pack.gltf))
             if not precise:
                 notes = (f"{note}; it is for playback only, in {path.name}, and asset.glb is exact",)
             if pack.usd:
-                write_skinned_usdz(self.path(packages.USD), surface, rig, about, pack.gltf)
+                write_skinned_usdz(self.path(package_files.USD), surface, rig, about, pack.gltf)
         elif pack.usd:
-            write_usdz(self.path(packages.USD), surface, self.fps, None, about, pack.gltf)
+            write_usdz(self.path(package_files.USD), surface, self.fps, None, about, pack.gltf)
         return notes
 
     def write_usd_splats(self) -> None:
         """Write point samples of the mesh, and the splats, as one USDZ."""
         if self.pack.usd:
-            path, about = self.path(packages.USD_SPLATS), _extras(self.notes)
+            path, about = self.path(package_files.USD_SPLATS), _extras(self.notes)
             write_usdz(path, self.surface, self.fps, self.states, about, self.pack.gltf, open_pbr=True, half=True)
 
     def write_splats(self) -> Sequence[str]:
         """Write the Gaussians of every frame in the requested formats, and for the viewer."""
         pack, states = self.pack, self.states
-        self.path(packages.WEB_SPLATS).write_bytes(write_web_splats(states, self.fps))
-        folder = self.path(packages.WEB_SPLATS).parent
+        self.path(package_files.WEB_SPLATS).write_bytes(write_web_splats(states, self.fps))
+        folder = self.path(package_files.WEB_SPLATS).parent
         if pack.splats:
             write_splats(folder, states)
         if pack.spz:
@@ -181,19 +181,19 @@ class PackageWriter:
 
     def write_canonical(self) -> None:
         """Write the fit, the subject and the driving video, from which everything else was made."""
-        for name, port in ((packages.GAUSSIANS, "gaussians"), (packages.SUBJECT, "subject")):
+        for name, port in ((package_files.GAUSSIANS, "gaussians"), (package_files.SUBJECT, "subject")):
             shutil.copyfile(self.inputs[port], self.path(name))
-        write_compact(self.path(packages.COMPACT), self.fit)
+        write_compact(self.path(package_files.COMPACT), self.fit)
         even = self.video.frames.shape[1] // 2 * 2  # pixels; some players cannot show videos of odd sizes
-        write_mp4(self.path(packages.DRIVING), self.video.over(torch.ones(3))[:, :even, :even], self.video.fps)
+        write_mp4(self.path(package_files.DRIVING), self.video.over(torch.ones(3))[:, :even, :even], self.video.fps)
 
     def write_preview(self) -> Sequence[str]:
         """Write the video of the motion, as splats and as a lit mesh, with an orbiting camera."""
-        return write_preview(self.path(packages.PREVIEW), *self._motion, self.points, self._mesh_at_frame)
+        return write_preview(self.path(package_files.PREVIEW), *self._motion, self.points, self._mesh_at_frame)
 
     def write_moving_picture(self) -> None:
         """Write the same as a small animated WebP for web pages."""
-        write_webp(self.path(packages.MOVING_PICTURE), *self._motion, self.points)
+        write_webp(self.path(package_files.MOVING_PICTURE), *self._motion, self.points)
 
     @cached_property
     def points(self) -> Float[Tensor, "t p 3"]:
@@ -209,7 +209,7 @@ class PackageWriter:
         """Write the video of the first frame on a turntable."""
         fit = self.fit
         first = pose_gaussians(fit.gaussians, fit.deformation, fit.frames, torch.zeros(1)).at(0)
-        return write_turntable(self.path(packages.TURNTABLE), first, self.rasterizer, self.pack)
+        return write_turntable(self.path(package_files.TURNTABLE), first, self.rasterizer, self.pack)
 
     def write_sheet(self) -> None:
         """Write the contact sheet."""
@@ -217,7 +217,7 @@ class PackageWriter:
         sheet = draw_contact_sheet(
             fit.gaussians, fit.deformation, self.video, self.rasterizer, self.pack, self.points, self._mesh_at_frame
         )
-        write_png(self.path(packages.SHEET), sheet)
+        write_png(self.path(package_files.SHEET), sheet)
 
     @cached_property
     def _fitted_surface(self) -> Surface:
@@ -257,7 +257,7 @@ def run(job: Job) -> StepReport:
             for done, written in enumerate([threads.submit(write) for write in writers], 1):
                 notes += written.result() or ()
                 job.progress(done, len(writers), {})
-        shutil.copyfile(package.folder / packages.SHEET, job.outputs["sheet"])
+        shutil.copyfile(package.folder / package_files.SHEET, job.outputs["sheet"])
         names = sorted(path.relative_to(package.folder).as_posix() for path in package.folder.rglob("*.*"))
         frames = len(package.states.means)
         manifest = Manifest(
@@ -272,12 +272,12 @@ def run(job: Job) -> StepReport:
             placement=PackagePlacement(scale=package.placement.scale, translation=package.placement.translation),
             camera=Camera.placed(package.placement, whole_fov_y_deg(package.points)),
             ply_axes="y_down",
-            files={name: packages.about(name) for name in names},
+            files={name: package_files.about(name) for name in names},
             notes=(*package.notes, *notes),
         )
         text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
         files = [(name, (package.folder / name).read_bytes()) for name in names]
-        write_zip(job.outputs["package"], [(MANIFEST, text.encode()), *files])
+        write_zip(job.outputs["package"], [(package_files.MANIFEST, text.encode()), *files])
     return StepReport(backend=f"{job.settings.rasterizer} rasterizer", notes=tuple(notes))
 
 
@@ -303,7 +303,7 @@ def _read_inputs(job: Job, scratch: Path) -> PackageWriter:
         surface = resample_asset(surface, gaussians, deformation, frames, fps)
     if pack.delight and "moving" not in job.inputs:  # a user's model keeps its textures
         surface = _delit(surface)
-    placement = place(surface, pack.height_m, pack.ground)
+    placement = ground_placement(surface, pack.height_m, pack.ground)
     states = pose_gaussians_in_chunks(gaussians, deformation, frames, resampled_positions(frames, video.fps, fps))
     return PackageWriter(
         folder=scratch / "package",

@@ -1,4 +1,4 @@
-"""Step that chooses a tracked mesh or a mesh per frame, by trial meshes, before meshes are extracted."""
+"""Step that selects a tracked mesh or a mesh per frame by trial meshes, before the extraction."""
 
 from functools import partial
 from typing import Literal

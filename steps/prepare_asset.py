@@ -89,8 +89,8 @@ def render_subject(cloud: Gaussians, size: int, rasterize: Rasterizer) -> Float[
     """Render a placed model from azimuth 0 as a cut-out, straight alpha."""
     camera = OrbitCamera(width=SUPERSAMPLE * size, height=SUPERSAMPLE * size)
     with torch.no_grad():
-        drawn = rasterize(cloud, [camera], torch.zeros(3))
-    color, alpha = (resize(image, (size, size))[0] for image in (drawn.color, drawn.alpha))
+        rendering = rasterize(cloud, [camera], torch.zeros(3))
+    color, alpha = (resize(image, (size, size))[0] for image in (rendering.color, rendering.alpha))
     return torch.cat([color / alpha.clamp_min(1e-4), alpha], -1).clamp(0, 1)
 
 
@@ -108,9 +108,9 @@ def posed_model(
     settings: AssetSettings,
     ups: Sequence[str],
 ) -> PosedModel | None:
-    """Return the model in the pose of the first frame, from the side that shows it best.
+    """Return the model in the pose of the first frame, at the azimuth that agrees best.
 
-    None where it agrees as it rests, has no skeleton, or does not agree better in any pose.
+    None if it agrees in its rest pose, has no skeleton, or does not agree better in any pose.
 
     Args:
         glb: the model.

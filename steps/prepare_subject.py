@@ -71,7 +71,7 @@ def run(job: Job) -> StepReport:
 
 
 def read_hint(job: Job, source: Source, prepared: PreparedSubject) -> tuple[DepthField, str] | None:
-    """Return what the user says about the depth, and a sentence about it; None if nothing is given."""
+    """Return the depth field that the user gave, and a sentence about it; None if nothing is given."""
     settings: SubjectSettings = job.settings.subject
     for port, read in (("depth", read_depth), ("layers", read_layers)):
         if port in job.inputs:
@@ -94,11 +94,11 @@ def turn_note(turn_deg: float) -> str:
 
 
 def picture_of_depth(field: DepthField) -> Float[Tensor, "t t 3"]:
-    """Draw a field in gray, near parts bright; white where nothing is known."""
+    """Render a depth field in gray, near parts bright; white where the depth is unknown."""
     middle = field.middle[field.known]
     gray = 0.1 + 0.7 * (field.middle - middle.min()) / (middle.max() - middle.min()).clamp(min=1e-6)
-    drawn = torch.where(field.known, gray, 1.0)[..., None].expand(-1, -1, 3)
-    return resize(drawn[None], (TILE, TILE))[0].clamp(0, 1)
+    shown = torch.where(field.known, gray, 1.0)[..., None].expand(-1, -1, 3)
+    return resize(shown[None], (TILE, TILE))[0].clamp(0, 1)
 
 
 def picture_of(source: Float[Tensor, "h w 4"], cutout: Float[Tensor, "s s 4"]) -> Float[Tensor, "t w3 3"]:

@@ -44,14 +44,14 @@ class Painted:
         paint = self.creature.color(rest.points, self.creature.features) * light
         return torch.from_numpy(paint.clip(0, 1).astype(np.float32))
 
-    def vertices(self, moment: float) -> Float[Tensor, "v 3"]:
+    def vertices(self, time: float) -> Float[Tensor, "v 3"]:
         """Return the vertices at a time, world units; 0 and 1 are the same."""
-        return torch.from_numpy(self.creature.at(moment).astype(np.float32))
+        return torch.from_numpy(self.creature.at(time).astype(np.float32))
 
-    def draw(self, moment: float, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
+    def draw(self, time: float, cameras: Sequence[OrbitCamera]) -> Float[Tensor, "b h w 4"]:
         """Render cut-outs from cameras of one size, straight alpha; empty pixels are black."""
         fine = [replace(camera, width=SAMPLES * camera.width, height=SAMPLES * camera.height) for camera in cameras]
-        fragments = rasterize_mesh(self.vertices(moment), self.faces, fine)
+        fragments = rasterize_mesh(self.vertices(time), self.faces, fine)
         covered = (fragments.faces >= 0)[..., None].float()
         samples = torch.cat([interpolate(fragments, self.faces, self.colors), covered], -1)
         small = avg_pool2d(samples.permute(0, 3, 1, 2), SAMPLES).permute(0, 2, 3, 1)

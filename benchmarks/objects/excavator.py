@@ -61,9 +61,9 @@ class Excavator:
         """Return the part number of every vertex, "v 1"; no triangle has two."""
         return self.part[:, None].astype(float)
 
-    def at(self, moment: float) -> ndarray:
+    def at(self, time: float) -> ndarray:
         """Return the vertices at a time of the cycle; 0 and 1 are the same."""
-        phase = 2 * np.pi * moment
+        phase = 2 * np.pi * time
         house = _hinge(PIVOT, _turn_about_y(TURN * np.sin(phase)))
         boom = _chained(house, _hinge(BOOM, turn_about_z(LIFT * np.sin(phase + 1.3) - 0.05)))
         stick = _chained(boom, _hinge(STICK, turn_about_z(CRANE * np.cos(phase + 0.4))))

@@ -38,9 +38,9 @@ class Jellyfish:
         points = self.skin.points
         return np.stack([_bell(points), _tentacles()(points), _arms()(points)], 1)
 
-    def at(self, moment: float) -> ndarray:
+    def at(self, time: float) -> ndarray:
         """Return the vertices at a time of the stroke; 0 and 1 are the same."""
-        phase = 2 * np.pi * moment
+        phase = 2 * np.pi * time
         x, y, z = self.skin.points.T
         below = APEX - y
         inside = step(0.30, 0.55, below)  # 0 at the top, 1 from the rim down

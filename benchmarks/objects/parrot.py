@@ -71,9 +71,9 @@ class Parrot:
         total = np.concatenate(weights, 1)
         return Bones(total / total.sum(1, keepdims=True), rests)
 
-    def at(self, moment: float) -> ndarray:
+    def at(self, time: float) -> ndarray:
         """Return the vertices at a time of the wing beat; 0 and 1 are the same."""
-        phase = 2 * np.pi * moment
+        phase = 2 * np.pi * time
         along = np.linspace(0, 1, len(JOINTS))
         angles = FLAP * (0.55 + 0.45 * along) * np.sin(phase - LAG * along) + 0.10
         steps = np.diff(JOINTS, prepend=JOINTS[0])

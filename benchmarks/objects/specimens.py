@@ -92,10 +92,10 @@ def read_specimen(ground_truth: GroundTruth, frames: int) -> Specimen:
     stride = -(-len(ground_truth.inputs) // frames)
     full = read_bank_folder(ground_truth.bank)
     kept = [column for column, frame in enumerate(full.frames) if frame % stride == 0]
-    moments = tuple(full.frames[column] // stride for column in kept)
-    if 0 not in moments:
+    frame_numbers = tuple(full.frames[column] // stride for column in kept)
+    if 0 not in frame_numbers:
         raise BadInput(f"the bank/ of {ground_truth.name} has no frame 0; the static stage needs it")
-    bank = Bank(full.cameras, moments, full.pictures[:, kept])
+    bank = Bank(full.cameras, frame_numbers, full.pictures[:, kept])
     pictures = _pictures(ground_truth, stride)
     size = pictures.shape[2]
     cameras = tuple(OrbitCamera(0, view.azimuth_deg, width=size, height=size) for view in ground_truth.views)

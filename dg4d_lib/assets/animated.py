@@ -56,18 +56,18 @@ def pose_gaussians(
         weight = (positions - (frames - 1)).clamp(min=0.0).to(gaussians.means)[:, None, None]  # of the first frame
         if (weight > 0).any():
             first = deformation.displace(gaussians.means, gaussians.means.new_zeros(1)).apply(gaussians)
-            states = _mixed(states, first, weight)
+            states = _interpolate(states, first, weight)
         return states
 
 
 def states_between(states: Gaussians, positions: Float[Tensor, " b"]) -> Gaussians:
     """Interpolate Gaussians that are given per frame."""
     before, after, share = _neighbors(positions, len(states.means))
-    return _mixed(states.states(before), states.states(after), share.to(states.means))
+    return _interpolate(states.states(before), states.states(after), share.to(states.means))
 
 
-def _mixed(states: Gaussians, others: Gaussians, share: Float[Tensor, "b 1 1"]) -> Gaussians:
-    """Return states between two, linearly; q and -q are one rotation, of which the nearer one counts."""
+def _interpolate(states: Gaussians, others: Gaussians, share: Float[Tensor, "b 1 1"]) -> Gaussians:
+    """Interpolate two states linearly; of q and -q, which are one rotation, take the nearer one."""
     opposite = (states.quats * others.quats).sum(-1, keepdim=True) < 0
     return replace(
         states,

@@ -57,7 +57,7 @@ class Placement:
         return replace(gaussians, means=means, log_scales=log_scales)
 
 
-def place(surface: Surface, height_m: float, ground: bool) -> Placement:
+def ground_placement(surface: Surface, height_m: float, ground: bool) -> Placement:
     """Return the placement that gives an asset its height and puts it on the ground.
 
     Args:

@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import FLOAT, INT, KERNEL, LANES, LONG, SimdBuilder, Value, pointers
 from dg4d_lib.kernels.workers import run_parallel, split_range, thread_count
 

@@ -21,7 +21,7 @@ class OnParts(nn.Module):
     Motions of parts are interpolated between frames, rotations along the chord.
 
     Args:
-        field: deformation of the Gaussians at rest; what it predicts is not turned with the parts.
+        field: deformation of the Gaussians at rest; its displacements are not rotated with the parts.
         owners: part of every Gaussian.
         rest: rotations of the Gaussians at rest, wxyz, any norm.
         centers: of the parts at rest, world units.

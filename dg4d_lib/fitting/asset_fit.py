@@ -31,9 +31,9 @@ from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.video.optical_flow import optical_flow
 
 ADVICE = "lower asset.lr"
-FLOW_UNIT = 0.02  # of the picture's side: error of the flow up to which its loss is quadratic
-MATCH_ITERATIONS = 80  # of the colors at the first frame
-MATCH_LR = (0.05, 0.1, 0.01)  # of harmonics, opacities and sizes
+FLOW_UNIT = 0.02  # flow error up to which its loss is quadratic, share of the picture's side
+MATCH_ITERATIONS = 80  # iterations of the color fit at the first frame
+MATCH_LR = (0.05, 0.1, 0.01)  # learning rates of harmonics, opacities and sizes
 SPEEDS = (0.0, CONTINUED, 1.0)  # extrapolations of the last motion that are tried, where rotations are integrated
 
 
@@ -81,8 +81,10 @@ class AssetFit:
         optimizer = Adam({"params": values[name], "lr": lr} for name, lr in zip(names, MATCH_LR, strict=True))
         for step in range(MATCH_ITERATIONS):
             state = replace(self.plain, means=means, quats=quat_multiply(quats, self.plain.quats), **values)
-            drawn = self.rasterize(antialiased(state, self.camera), [self.camera], means.new_tensor(WHITE))
-            loss = (drawn.color - self.colors[:1]).square().mean() + (drawn.alpha - self.alphas[:1]).square().mean()
+            rendering = self.rasterize(antialiased(state, self.camera), [self.camera], means.new_tensor(WHITE))
+            loss = (rendering.color - self.colors[:1]).square().mean() + (
+                rendering.alpha - self.alphas[:1]
+            ).square().mean()
             optimizer.zero_grad()
             loss.backward()
             gradients = [value.grad for value in values.values()]
@@ -95,12 +97,12 @@ class AssetFit:
         return self.cloud
 
     def relative(self, values: Tensor) -> Tensor:
-        """Return lengths in tenths of the model's size."""
+        """Convert lengths to tenths of the model's size."""
         return values / self.unit
 
     @torch.no_grad()
     def start(self, tracked: Sequence[NodeVariables], frame: int) -> NodeVariables:
-        """Return where the descent of a frame starts, after those before it, the first of which is at rest.
+        """Return the initial variables of a frame, given those of earlier frames, of which the first is at rest.
 
         Where rotations are integrated, it is the extrapolation at one of several speeds, or the variables of the frame
         with the most similar picture, whichever has the smallest loss: wings turn back, and steps repeat.
@@ -117,20 +119,20 @@ class AssetFit:
 
     @torch.no_grad()
     def difference(self, motion: NodeMotion) -> float:
-        """Return how much a motion and the video differ: their losses of color and alpha, over all frames."""
+        """Return the losses of color and alpha between a motion and the video, over all frames."""
         return self.difference_of(self._means(motion))
 
     @torch.no_grad()
     def difference_of(self, means: Float[Tensor, "t n 3"]) -> float:
-        """Return how much the Gaussians at these places and the video differ, over all frames."""
+        """Return the losses of color and alpha between the Gaussians at these means and the video, over all frames."""
         losses = self._picture_losses(means, list(range(len(means))))
         return float(losses["color"] + losses["alpha"])
 
     @torch.no_grad()
     def outline_errors(self, motion: NodeMotion) -> Float[Tensor, " t"]:
         """Return the weighted loss of alpha at every frame."""
-        drawn = self._rendering(self._means(motion)).alpha
-        return pyramid_residuals(drawn, self.alphas).square().sum(1) * (self.settings.alpha_weight / self.area)
+        alphas = self._rendering(self._means(motion)).alpha
+        return pyramid_residuals(alphas, self.alphas).square().sum(1) * (self.settings.alpha_weight / self.area)
 
     def residuals(self, motion: NodeMotion, frames: list[int]) -> Float[Tensor, "t r"]:
         """Return numbers per frame whose squares sum to the losses of color, alpha and shifts across the plane."""
@@ -176,7 +178,7 @@ class AssetFit:
 
     @torch.no_grad()
     def silhouettes(self, motion: NodeMotion) -> Bool[Tensor, "t h w 1"]:
-        """Return where the model is in the pictures."""
+        """Return the rendered silhouettes of the model, alpha above 0.5."""
         return self._rendering(self._means(motion)).alpha > 0.5
 
     def _means(self, motion: NodeMotion) -> Float[Tensor, "t n 3"]:
@@ -198,12 +200,12 @@ class AssetFit:
         """Return the Gaussians that were visible before a frame, and the pixels that the optical flow moves them to."""
         means = before.points(self.cloud.means, self.graph)
         state = replace(self.cloud, means=means[0])
-        drawn = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
+        rendering = self.rasterize(state, [self.camera], means.new_tensor(WHITE))
         pixels, depth = self._projected(means[0])
         size = self.settings.size
         column, row = pixels.floor().long().clamp(0, size - 1).T
-        alpha = drawn.alpha[0, row, column, 0]
-        surface = drawn.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
+        alpha = rendering.alpha[0, row, column, 0]
+        surface = rendering.depth[0, row, column, 0] / alpha.clamp(min=1e-3)
         visible = torch.nonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))[:, 0]
         earlier, later = (luminance(self.colors[number]).cpu().numpy() for number in (frame - 1, frame))
         flow = torch.from_numpy(optical_flow(earlier, later)).permute(1, 2, 0).to(means)  # rows, columns

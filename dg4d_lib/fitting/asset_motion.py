@@ -29,7 +29,7 @@ from dg4d_lib.mesh.models.control_graph import ControlGraph
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
-FLOW_SHARE = 0.6  # of the iterations of a descent that follow the optical flow; the rest follow the pictures alone
+FLOW_SHARE = 0.6  # share of the iterations with a flow loss; later ones use picture losses alone
 EXPLAINED = 0.04  # error of the first frame up to which the model is at rest there
 Report = Callable[[int, dict[str, float]], None]
 
@@ -69,7 +69,7 @@ def fit_asset_motion(
     for rigidity_loss in _rigidity_losses(settings):
         one = settings.model_copy(update={"rigidity_loss": rigidity_loss})
         fit = AssetFit(thin, bound, video, rasterize, one, normal, resting)
-        motion = _fitted(fit, video, one, generator, partial(report_after, report, done))
+        motion = _track_and_refine(fit, video, one, generator, partial(report_after, report, done))
         found.append((fit.difference(motion), motion, fit))
         done += _free_iterations(one, len(video))
     difference, motion, fit = min(found, key=lambda one: one[0])
@@ -100,18 +100,18 @@ def _rigidity_losses(settings: AssetSettings) -> list[Literal["l1", "log"]]:
     return ["l1", "log"] if settings.rigidity_loss == "best" else [settings.rigidity_loss]
 
 
-def _fitted(
+def _track_and_refine(
     fit: AssetFit, video: DrivingVideo, settings: AssetSettings, generator: torch.Generator, report: Report
 ) -> NodeMotion:
     """Track all frames, then refine them together."""
     frames, done = len(video), settings.track_iterations * len(video)
-    track = _followed if settings.tracking == "flow" else _descended
+    track = _track_by_flow if settings.tracking == "flow" else _track_by_descent
     variables = NodeVariables.joined(track(fit, video, settings, report)).trainable()
     descent = NodeDescent(variables, fit.basis, held=int(fit.resting))
     for step in range(settings.joint_iterations):
-        chosen = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
+        selected = torch.randperm(frames, generator=generator)[: min(settings.joint_frames, frames)].sort().values
         moved = variables.motion(fit.basis)
-        losses = fit.losses(moved.at(chosen), chosen.tolist())
+        losses = fit.losses(moved.at(selected), selected.tolist())
         if frames > 2:
             nodes = moved.nodes(fit.graph)
             acceleration = fit.relative(nodes[2:] - 2 * nodes[1:-1] + nodes[:-2])
@@ -123,14 +123,14 @@ def _fitted(
     return variables.detach().motion(fit.basis)
 
 
-def _followed(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
+def _track_by_flow(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
     """Track the frames by optical flow, loops from both ends; return their variables."""
     tracker = FlowTracker(fit.cloud, fit.graph, fit.colors, fit.alphas, fit.rasterize, settings, fit.normal)
     poses = {0: _first_pose(fit, tracker)}
     report(settings.track_iterations, {"color": tracker.error(poses[0], 0)})
     for order in tracking_orders(video, 0):
         for number, frame in enumerate(order[1:], 1):
-            poses[frame] = tracker.tracked(poses, order[:number], frame)
+            poses[frame] = tracker.track(poses, order[:number], frame)
             report(len(poses) * settings.track_iterations, {"color": tracker.error(poses[frame], frame)})
     return [NodeVariables.of(poses[frame], fit.basis) for frame in range(len(video))]
 
@@ -147,12 +147,14 @@ def _first_pose(fit: AssetFit, tracker: FlowTracker) -> Pose:
     if fit.resting:
         return rest
     tracker.cloud = unmatched
-    followed = tracker.followed(rest, 0)
+    followed = tracker.follow_flow(rest, 0)
     tracker.cloud = fit.match_first_frame(followed)
     return followed
 
 
-def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report) -> list[NodeVariables]:
+def _track_by_descent(
+    fit: AssetFit, video: DrivingVideo, settings: AssetSettings, report: Report
+) -> list[NodeVariables]:
     """Track the frames one after the other along gradients; return their variables."""
     tracked: list[NodeVariables] = [NodeVariables.still(1, fit.graph)] * (2 if fit.resting else 1)
     done = settings.track_iterations * (len(tracked) - 1)
@@ -179,6 +181,6 @@ def _descended(fit: AssetFit, video: DrivingVideo, settings: AssetSettings, repo
 
 
 def thinned_graph(cloud: Gaussians, graph: ControlGraph, count: int) -> tuple[Gaussians, ControlGraph]:
-    """Return about `count` of the Gaussians, evenly chosen and larger to cover as much."""
+    """Thin the Gaussians evenly to about `count`, enlarged to cover the same area; return them with their graph."""
     step = max(1, round(len(cloud) / count))
     return thinned(cloud, step), graph.of(torch.arange(0, len(cloud), step))

@@ -34,7 +34,7 @@ KEPT = 3  # candidates that are refined
 APART = 60  # degrees between the azimuths of placements that count as different
 ITERATIONS = 40
 REACH = 0.6  # world units: half diagonal of a model without a picture
-STANDS = 0.08  # advantage of a model as it stands: its depth is right, too, which outlines hardly show
+STANDS = 0.08  # score bonus of the identity placement: its depth is right, too, which outlines hardly show
 UPRIGHT = {"y": (1.0, 0.0, 0.0, 0.0), "z": (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0), "-y": (0.0, 1.0, 0.0, 0.0)}
 
 
@@ -62,7 +62,7 @@ class Placement:
 
     @classmethod
     def identity(cls) -> "Placement":
-        """Return the placement of a model that is in the world as it stands."""
+        """Return the identity placement: model and world coordinates are equal."""
         return cls(torch.tensor(UPRIGHT["y"]), 1.0, torch.zeros(3))
 
     @property
@@ -114,11 +114,11 @@ def find_placement(
         cloud: Gaussians in the coordinates of the model.
         subject: square picture, straight alpha.
         rasterize: rasterizer.
-        azimuth_deg: azimuth of the model, if the user says it.
+        azimuth_deg: azimuth of the model, if the user gave it.
         ups: axes that may point up.
     """
-    sparse, best = _searched(cloud, subject, rasterize, azimuth_deg, ups)
-    refined = [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in best[:KEPT]]
+    sparse, best = _coarse_search(cloud, subject, rasterize, azimuth_deg, ups)
+    refined = [_refine(sparse, one, subject, rasterize, azimuth_deg is None) for one in best[:KEPT]]
     as_it_stands = Placement.identity()
     tried = [*refined, *([as_it_stands] if not azimuth_deg else [])]
     results = judge(cloud, tried, subject, rasterize, FINE_SIZE)
@@ -140,15 +140,15 @@ def distinct_placements(
     Outlines tell the front from the back only of a model that stands as the picture shows it. The arguments are those
     of `find_placement`.
     """
-    sparse, ranked = _searched(cloud, subject, rasterize, azimuth_deg, ups)
-    chosen: list[Placement] = []
+    sparse, ranked = _coarse_search(cloud, subject, rasterize, azimuth_deg, ups)
+    selected: list[Placement] = []
     for one in ranked:
-        if all(_degrees_between(one.azimuth_deg, other.azimuth_deg) >= APART for other in chosen):
-            chosen.append(one)
-    return [_refined(sparse, one, subject, rasterize, azimuth_deg is None) for one in chosen[:KEPT]]
+        if all(_degrees_between(one.azimuth_deg, other.azimuth_deg) >= APART for other in selected):
+            selected.append(one)
+    return [_refine(sparse, one, subject, rasterize, azimuth_deg is None) for one in selected[:KEPT]]
 
 
-def _searched(
+def _coarse_search(
     cloud: Gaussians,
     subject: Float[Tensor, "h w 4"],
     rasterize: Rasterizer,
@@ -160,7 +160,7 @@ def _searched(
     azimuths = [azimuth_deg] if azimuth_deg is not None else [360 * step / STEPS for step in range(STEPS)]
     candidates = [centered_placement(sparse, azimuth, up) for up in ups for azimuth in azimuths]
     for _ in range(2):
-        candidates = _framed(sparse, candidates, subject, rasterize)
+        candidates = _match_outlines(sparse, candidates, subject, rasterize)
     judged = judge(sparse, candidates, subject, rasterize, SIZE)
     return sparse, sorted(judged, key=lambda one: -one.score)
 
@@ -199,19 +199,21 @@ def _renders(
     """Return color over white and alpha of every placement; opacities follow its scale, so none share a batch."""
     camera = OrbitCamera(width=size, height=size)
     with torch.no_grad():
-        drawn = [rasterize(antialiased(one.apply(cloud), camera), [camera], torch.tensor(WHITE)) for one in placements]
-    return [(one.color[0], one.alpha[0]) for one in drawn]
+        renderings = [
+            rasterize(antialiased(one.apply(cloud), camera), [camera], torch.tensor(WHITE)) for one in placements
+        ]
+    return [(one.color[0], one.alpha[0]) for one in renderings]
 
 
-def _framed(
+def _match_outlines(
     cloud: Gaussians, placements: Sequence[Placement], subject: Float[Tensor, "h w 4"], rasterize: Rasterizer
 ) -> list[Placement]:
     """Scale and move placements so that area and center of their outlines are those of the subject."""
     mask = resize_cutouts(subject[None], SIZE)[1][0]
-    area, center = _moments(mask)
+    area, center = _area_and_center(mask)
     framed = []
     for placement, (_, alpha) in zip(placements, _renders(cloud, placements, rasterize, SIZE), strict=True):
-        ours, middle = _moments(alpha)
+        ours, middle = _area_and_center(alpha)
         ratio = float((area / ours.clamp(min=1e-3)).sqrt().clamp(0.2, 5))
         pixel = RADIUS * 2 * math.tan(math.radians(OrbitCamera().fov_y_deg) / 2) / SIZE  # world units at the origin
         step = (center - ratio * (middle - SIZE / 2) - SIZE / 2) * pixel
@@ -220,7 +222,7 @@ def _framed(
     return framed
 
 
-def _moments(mask: Float[Tensor, "s s 1"]) -> tuple[Float[Tensor, ""], Float[Tensor, " 2"]]:
+def _area_and_center(mask: Float[Tensor, "s s 1"]) -> tuple[Float[Tensor, ""], Float[Tensor, " 2"]]:
     """Return area and center (column, row) of a mask, in pixels."""
     weights = mask[..., 0]
     area = weights.sum()
@@ -229,7 +231,7 @@ def _moments(mask: Float[Tensor, "s s 1"]) -> tuple[Float[Tensor, ""], Float[Ten
     return area, center
 
 
-def _refined(
+def _refine(
     cloud: Gaussians, start: Placement, subject: Float[Tensor, "h w 4"], rasterize: Rasterizer, turning: bool
 ) -> Placement:
     """Refine azimuth, scale and position by gradients; the distance to the camera stays."""
@@ -241,9 +243,9 @@ def _refined(
     area = mask.mean().clamp(min=1e-3)
     cloud = replace(cloud, opacity_logits=antialiased(start.apply(cloud), camera).opacity_logits)
     for _ in range(ITERATIONS):
-        quat, log_scale, shift = _moved(start, values)
-        drawn = rasterize(_similar(cloud, quat, log_scale, shift), [camera], torch.tensor(WHITE))
-        color, alpha = (drawn.color - target).movedim(-1, 1), (drawn.alpha - mask).movedim(-1, 1)
+        quat, log_scale, shift = _similarity_of(start, values)
+        rendering = rasterize(_similar(cloud, quat, log_scale, shift), [camera], torch.tensor(WHITE))
+        color, alpha = (rendering.color - target).movedim(-1, 1), (rendering.alpha - mask).movedim(-1, 1)
         loss = torch.stack(
             [
                 (functional.avg_pool2d(part, level).square().mean() * weight)
@@ -255,13 +257,13 @@ def _refined(
         (loss / area).backward()
         adam.step()
     with torch.no_grad():
-        quat, log_scale, shift = _moved(start, values)
+        quat, log_scale, shift = _similarity_of(start, values)
     azimuth = (start.azimuth_deg - math.degrees(float(values["turn"].detach()))) % 360
     unit = functional.normalize(quat.detach(), dim=-1)
     return Placement(unit, float(log_scale.exp()), shift.detach(), azimuth)
 
 
-def _moved(
+def _similarity_of(
     start: Placement, values: dict[str, Tensor]
 ) -> tuple[Float[Tensor, " 4"], Float[Tensor, ""], Float[Tensor, " 3"]]:
     half = values["turn"][0] / 2

@@ -34,21 +34,21 @@ from dg4d_lib.video.optical_flow import optical_flow
 STEPS = 2  # Gauss-Newton steps per round
 MATCH_STEPS = 4  # towards matched patches
 FOLLOWED = 1500  # largest number of Gaussians that follow the flow
-FLOW_UNIT = 0.01  # of the picture's side: error of the flow up to which its loss is quadratic
+FLOW_UNIT = 0.01  # flow error up to which its loss is quadratic, share of the picture's side
 ROBUST = 0.02  # relative stretch, or radians, up to which the rigidity is quadratic
 LOG_SCALE = 0.3  # relative stretch, or radians, above which a logarithmic rigidity stays well below a linear one
 DEPTH_SLACK = 0.05  # world units by which a Gaussian may lie behind the visible surface
 SLANTED = 0.5  # cosine of normal and line of sight from which a mirror plane counts fully
-STILL = 0.15  # weight of the last frame's place beside that of the extrapolated one
-UNSEEN = 0.1  # of the weights of displacements that a video hardly shows; they suit the refinement
-GAIN = 0.02  # by which another start must lower the error
-LOST, JUMP = 0.1, 1.3  # error, and its growth since the last frame, from which parts are searched
+STILL = 0.15  # weight of the position in the last frame, against the extrapolated position
+UNSEEN = 0.1  # factor on the weights of displacements that a video hardly shows, tuned for the refinement
+GAIN = 0.02  # least relative decrease of the error by another start
+LOST, JUMP = 0.1, 1.3  # parts are searched from this error, and this ratio to the error of the last frame
 WINDOW = 8  # search of patches, in pixels of a picture of half the size, at 64 pixels of `asset.size`
-ALPHA_WEIGHT = 0.5  # of alpha beside a color, in patches
-LARGEST_COST = 0.3  # of a pixel, so that occluded ones do not decide
+ALPHA_WEIGHT = 0.5  # weight of alpha relative to color in patches
+LARGEST_COST = 0.3  # largest cost of a pixel, which bounds the effect of occlusions
 NEIGHBORS, SPREAD = 2, 0.3  # rounds and weight of the neighbors' costs
 PULL = 0.003  # cost of the farthest places of a patch
-SHARP = 0.01  # cost above the best place from which another one is told apart
+SHARP = 0.01  # cost difference from which a place counts as distinct from the best one
 
 # Arguments of NormalEquations.add: derivatives of residuals by the unknowns of nodes, these nodes, the residuals
 _Term: TypeAlias = tuple[Float[np.ndarray, "n k d 6"], Int[np.ndarray, "n k"], Float[np.ndarray, "n d"]]
@@ -109,11 +109,11 @@ class FlowTracker:
         self._features = _features(self._pictures, alphas)
         self._lumas = luminance(self._pictures).cpu().numpy()
 
-    def followed(self, pose: Pose, frame: int) -> Pose:
+    def follow_flow(self, pose: Pose, frame: int) -> Pose:
         """Return a pose that follows the optical flow to a frame, without regard to other frames."""
-        return self._followed(pose, pose, pose, frame)
+        return self._follow_rounds(pose, pose, pose, frame)
 
-    def tracked(self, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
+    def track(self, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
         """Return the pose at a frame.
 
         Args:
@@ -123,29 +123,29 @@ class FlowTracker:
         """
         last = poses[trail[-1]]
         start = poses[trail[max(len(trail) - 2, 0)]].continued(last)
-        found = self._followed(start, start, last, frame)
-        matched, targets = start, self._patches(start, frame)
+        found = self._follow_rounds(start, start, last, frame)
+        matched, targets = start, self._patch_targets(start, frame)
         for _ in range(MATCH_STEPS):
-            matched = self._solved(matched, targets, start, last)
-        found = self._better(found, self._followed(matched, matched, last, frame), frame)
+            matched = self._gauss_newton_step(matched, targets, start, last)
+        found = self._pick_better(found, self._follow_rounds(matched, matched, last, frame), frame)
         known = sorted(poses)
         alike = known[int((self._frames[known] - self._frames[frame]).square().mean((1, 2, 3)).argmin())]
         if alike != trail[-1]:  # the motion may come back
             again = poses[alike]
-            found = self._better(found, self._followed(again, again, again, frame), frame)
+            found = self._pick_better(found, self._follow_rounds(again, again, again, frame), frame)
         if self.error(found, frame) > max(LOST, JUMP * self.error(last, trail[-1])):
-            posed = self._parts.posed(last, frame)
-            found = self._better(found, self._followed(posed, posed, last, frame), frame)
+            posed = self._parts.best_pose(last, frame)
+            found = self._pick_better(found, self._follow_rounds(posed, posed, last, frame), frame)
         return found
 
-    def _better(self, found: Pose, other: Pose, frame: int) -> Pose:
+    def _pick_better(self, found: Pose, other: Pose, frame: int) -> Pose:
         """Return the first pose, or the other one if its error is smaller by `GAIN`."""
         return other if self.error(other, frame) < (1 - GAIN) * self.error(found, frame) else found
 
     def error(self, pose: Pose, frame: int) -> float:
         """Return the root mean square difference of the render and a frame, over the subject."""
-        drawn = self._draw(pose)[0]
-        difference = torch.cat([drawn.color[0], drawn.alpha[0]], -1) - self._frames[frame]
+        rendering = self._render(pose)[0]
+        difference = torch.cat([rendering.color[0], rendering.alpha[0]], -1) - self._frames[frame]
         smooth = functional.avg_pool2d(difference.movedim(-1, 0)[None], 3, 1, 1)
         return float(smooth.square().mean().sqrt() / self._alphas[frame].mean().clamp(min=1e-3).sqrt())
 
@@ -153,28 +153,28 @@ class FlowTracker:
     def _parts(self) -> PartSearch:
         return PartSearch(self.cloud, self._graph, self._pictures, self._alphas, self._backdrop, self._rasterize)
 
-    def _followed(self, pose: Pose, expected: Pose, last: Pose, frame: int) -> Pose:
+    def _follow_rounds(self, pose: Pose, expected: Pose, last: Pose, frame: int) -> Pose:
         """Return the pose after rounds of optical flow."""
         for _ in range(self._settings.track_iterations):
-            targets = self._flow(pose, frame)
+            targets = self._flow_targets(pose, frame)
             for _ in range(STEPS):
-                pose = self._solved(pose, targets, expected, last)
+                pose = self._gauss_newton_step(pose, targets, expected, last)
         return pose
 
-    def _flow(self, pose: Pose, frame: int) -> _Targets:
+    def _flow_targets(self, pose: Pose, frame: int) -> _Targets:
         """Return where the optical flow from the render moves the visible Gaussians."""
-        drawn, pixels, visible = self._seen(pose)
-        picture = luminance(self._over(drawn.color, drawn.alpha))[0].cpu().numpy()
+        rendering, pixels, visible = self._render_visible(pose)
+        picture = luminance(self._over(rendering.color, rendering.alpha))[0].cpu().numpy()
         flow = np.moveaxis(optical_flow(picture, self._lumas[frame])[::-1], 0, -1)  # columns, rows
         column, row = self._cells(pixels[visible]).T
         return _Targets(visible, pixels[visible] + flow[row, column], np.ones(len(visible)))
 
     @torch.no_grad()
-    def _patches(self, pose: Pose, frame: int) -> _Targets:
+    def _patch_targets(self, pose: Pose, frame: int) -> _Targets:
         """Return where the patches around the nodes are found in a frame, by color and alpha."""
-        drawn, pixels, visible = self._seen(pose)
+        rendering, pixels, visible = self._render_visible(pose)
         reach = max(2, WINDOW * self._settings.size // 64)
-        ours = _features(self._over(drawn.color, drawn.alpha), drawn.alpha)[0]
+        ours = _features(self._over(rendering.color, rendering.alpha), rendering.alpha)[0]
         theirs = functional.pad(self._features[frame], (reach,) * 4, mode="replicate")
         column, row = torch.from_numpy(self._cells(pixels[visible]) // 2).T
         down, right = torch.meshgrid(*[torch.arange(2 * reach + 1)] * 2, indexing="ij")
@@ -193,18 +193,18 @@ class FlowTracker:
         sure = np.square(1 - np.exp(-above / SHARP).mean(1))  # of patches that are alike everywhere: 0
         return _Targets(visible, pixels[visible] + 2.0 * offsets[best][nodes], sure[nodes])
 
-    def _seen(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 2"], Int[np.ndarray, " k"]]:
-        """Return the render, the pixels of all Gaussians, and some that are visible, evenly chosen."""
-        drawn, points = self._draw(pose)
+    def _render_visible(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 2"], Int[np.ndarray, " k"]]:
+        """Return the render, the pixels of all Gaussians, and evenly spaced ones of those that are visible."""
+        rendering, points = self._render(pose)
         pixels, depth, _ = self._projected(points)
         column, row = self._cells(pixels).T
-        alpha = drawn.alpha[0, ..., 0].numpy()[row, column]
-        surface = drawn.depth[0, ..., 0].numpy()[row, column] / alpha.clip(1e-3)
+        alpha = rendering.alpha[0, ..., 0].numpy()[row, column]
+        surface = rendering.depth[0, ..., 0].numpy()[row, column] / alpha.clip(1e-3)
         visible = np.flatnonzero((depth < surface + DEPTH_SLACK) & (alpha > 0.5))
-        return drawn, pixels, visible[:: max(1, -(-len(visible) // FOLLOWED))]
+        return rendering, pixels, visible[:: max(1, -(-len(visible) // FOLLOWED))]
 
     @torch.no_grad()
-    def _draw(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 3"]]:
+    def _render(self, pose: Pose) -> tuple[Rendering, Float[np.ndarray, "n 3"]]:
         points = self._points(pose, np.arange(len(self._rest)))[0]
         turned = self._graph.blend_rotations(pose.quats()[None])[0]
         state = replace(
@@ -241,7 +241,7 @@ class FlowTracker:
         """Return pictures over the backdrop that contrasts, from those over white."""
         return colors - (1 - alphas) * (1 - self._backdrop)
 
-    def _solved(self, pose: Pose, targets: _Targets, expected: Pose, last: Pose) -> Pose:
+    def _gauss_newton_step(self, pose: Pose, targets: _Targets, expected: Pose, last: Pose) -> Pose:
         """Return the pose after a Gauss-Newton step on all losses."""
         settings, count = self._settings, len(self._nodes)
         each = np.arange(count)[:, None]
@@ -313,7 +313,7 @@ class FlowTracker:
 def across_weight(settings: AssetSettings, normal: Float[np.ndarray, " 3"]) -> float:
     """Return the weight of displacements across the mirror plane, less where it is seen nearly edge-on.
 
-    The picture shows displacements across such a plane, and the plane does not tell depth.
+    The picture then shows displacements across the plane, and the plane gives no information on depth.
     """
     return float(settings.across * min(1.0, (normal[2] / SLANTED) ** 2))
 

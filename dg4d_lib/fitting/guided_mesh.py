@@ -31,12 +31,12 @@ TRIAL = DESCENT.model_copy(
     update={"size": 64, "nodes": 100, "fit_points": 2500, "track_iterations": 12, "joint_iterations": 0}
 )
 TRIAL_ROUNDS = ((2, 4),)  # passes of the registration to outlines in a trial
-TRIAL_FRAMES = 6  # at which silhouettes are compared
+TRIAL_FRAMES = 6  # frames at which silhouettes are compared
 TRIAL_GRID = 48  # cells per axis of the density field
 CANDIDATES = 3  # candidate frames with long outlines, besides the given ones
-HANDLE_COST = 0.01  # of the trial's IoU by which another frame may be worse for each handle that it has less
+HANDLE_COST = 0.01  # allowed loss of IoU per handle that another frame has less
 APART = 1 / 10  # smallest distance of two candidates, share of the frames
-SHORTLIST, MARGIN = 2, 0.03  # frames that are worth a whole extraction, and how far below the best trial
+SHORTLIST, MARGIN = 2, 0.03  # largest number of frames for full extraction, and their largest IoU gap to the best trial
 
 
 def follow_video(
@@ -180,9 +180,9 @@ def rank_guided_references(
         level, _ = select_level(field, rest, rasterize, settings.density_threshold)
         vertices, faces = (torch.from_numpy(array) for array in extract_surface(field, level))
         moved = track_vertices(vertices, faces, rest, video, rasterize, TRIAL, generator, frame)[compared]
-        chosen = states.states(compared)
+        selected = states.states(compared)
         offsets = register_to_outlines(
-            vertices, moved - vertices, faces, chosen, alpha, level, rasterize, coarse, TRIAL_ROUNDS
+            vertices, moved - vertices, faces, selected, alpha, level, rasterize, coarse, TRIAL_ROUNDS
         )
         scores[frame] = float(silhouette_iou(vertices + offsets, faces, silhouettes).mean())
     merits = {frame: score - HANDLE_COST * handles(frame) for frame, score in scores.items()}
@@ -192,11 +192,11 @@ def rank_guided_references(
 
 
 def frames_with_long_outlines(video: DrivingVideo, count: int) -> list[int]:
-    """Return frames whose outlines are long for their area, the longest first: limbs are apart there."""
+    """Return frames whose outlines are long for their area, the longest first: limbs do not touch there."""
     masks = (video.alpha[..., 0] > ALPHA_THRESHOLD).numpy(force=True)
     lengths = [perimeter(mask, 8) / max(mask.sum(), 1) ** 0.5 for mask in masks]
-    chosen: list[int] = []
+    selected: list[int] = []
     for frame in sorted(range(len(video)), key=lambda frame: -lengths[frame]):
-        if len(chosen) < count and all(abs(frame - other) > APART * len(video) for other in chosen):
-            chosen.append(frame)
-    return chosen
+        if len(selected) < count and all(abs(frame - other) > APART * len(video) for other in selected):
+            selected.append(frame)
+    return selected

@@ -19,13 +19,13 @@ from dg4d_lib.fitting.asset_fit import AssetFit
 from dg4d_lib.fitting.rigid_parts import RigidMotion, of_one_part
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 
-ANGLES = tuple(np.radians(np.arange(0.0, 211.0, 7.5)).tolist())  # that are tried at every frame
+ANGLES = tuple(np.radians(np.arange(0.0, 211.0, 7.5)).tolist())  # trial angles at every frame, radians
 SWING = 0.05  # loss per squared radian that the angle changes from frame to frame
-PROMISING, CLEARLY = 0.8, 0.6  # of the loss of the second best hinge, that the best one may have: at first, at last
-ALIKE, FAR = 0.7, 0.2  # cosine between two hinges that are one, and world units between their axes
-STEPS, ROUNDS = (0.04, 0.15, 0.15), 5  # of the search for a cut: along its normal and two tilts; halved without gain
-OPEN = 0.5  # radians: a hinge that opens less decides nothing
-DAMPING = 1e-3  # of the separating plane, relative to unit weights
+PROMISING, CLEARLY = 0.8, 0.6  # largest loss relative to the second best hinge: before and after the search for a cut
+ALIKE, FAR = 0.7, 0.2  # two hinges count as one from this cosine and up to this distance of their axes, world units
+STEPS, ROUNDS = (0.04, 0.15, 0.15), 5  # search for a cut: steps along its normal and of two tilts; halved without gain
+OPEN = 0.5  # radians: smallest opening of a hinge
+DAMPING = 1e-3  # ridge weight of the separating plane
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Cut:
         return Cut(normal, float(normal @ middle.double().numpy()))
 
     def above(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Return which points lie on the side of part 1."""
+        """Mark the points on the side of part 1."""
         return torch.from_numpy(points.double().numpy() @ self.normal > self.offset)
 
     def hinges(self, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> list[Hinge]:
@@ -144,7 +144,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Found:
-    """A cut, the hinge of what lies above it, and how it opens.
+    """Result of a hinge search: cut, hinge of the part above it, and opening angles.
 
     Attributes:
         loss: of the outlines, and of changes of the angles.
@@ -167,7 +167,7 @@ class HingeSearch:
     def __init__(
         self, fit: AssetFit, motion: RigidMotion, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
     ) -> None:
-        """Store what is compared.
+        """Store the inputs.
 
         Args:
             fit: of the subject.

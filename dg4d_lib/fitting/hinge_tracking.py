@@ -24,10 +24,10 @@ from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.video.driving import DrivingVideo
 
-WORSE = 2.5  # times the difference of the free motion from the video, that rigid parts may have: insides are unknown
-NEAR = 0.12  # world units: edges between the parts that are so near to the hinge hold them together
-TORN, MOST = 0.4, 0.98  # logarithm of the change of lengths at a lid that opens, and the quantile that is compared
-HINGE_ITERATIONS = 2 * ITERATIONS  # that are reported at most
+WORSE = 2.5  # largest error of two rigid parts relative to the free motion: insides are unknown
+NEAR = 0.12  # world units: edges between the parts this close to the hinge connect them
+TORN, MOST = 0.4, 0.98  # least log ratio of edge lengths at an opening lid, and the quantile that is compared
+HINGE_ITERATIONS = 2 * ITERATIONS  # largest number of reported iterations
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def track_hinge(
     settings: AssetSettings,
     report: Report = lambda iteration, values: None,
 ) -> Hinged | None:
-    """Return the motion of a surface as that of a part and another one on a hinge, if it shows the video so.
+    """Track a surface as two rigid parts joined by a hinge, if such a motion explains the video.
 
     Args:
         free: the surface at all frames of a motion along the video without parts.
@@ -113,7 +113,7 @@ def track_hinge(
 
 
 def _tears(nodes: Float[Tensor, "t m 3"], edges: Int[Tensor, "e 2"], above: Bool[Tensor, " m"]) -> bool:
-    """Return True if edges across a cut become so much longer or shorter as no bend of a surface needs."""
+    """Return True if edges across a cut change their length more than bending the surface would."""
     across = edges[above[edges[:, 0]] != above[edges[:, 1]]]
     if not len(across):
         return False

@@ -24,6 +24,7 @@ from dg4d_lib.settings import MotionSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.known import KnownView
 
+MARGIN = 0.1  # around the means, share of the longest side of their bounding box
 ADVICE = "lower the learning rates (motion.*_lr) or the weights"
 Report = Callable[[int, dict[str, float]], None]
 
@@ -71,7 +72,7 @@ def fit_motion(
     times = video.times.to(device)
     white = torch.tensor(WHITE, device=device)
     known_frames, known_images = known_pairs(known or {}, device)
-    gaussians, groups = trained(gaussians.detach(), deformation, settings)
+    gaussians, groups = trainable_cloud(gaussians.detach(), deformation, settings)
     adam = Adam(groups, eps=1e-15)
     rates = [float(group["lr"]) for group in adam.param_groups]
     neighbors = neighborhoods(gaussians.means) if settings.rigidity_weight else None
@@ -83,16 +84,16 @@ def fit_motion(
             means_lr = log_linear(settings.means_lr, settings.means_lr_end, progress)
             adam.param_groups[0]["lr"] = settings.length_scale * means_lr
         frames = sample_frames(len(video), settings.frames_per_iteration, generator)
-        chosen = to_device_async(frames, device)
-        moved = deformation.displace(gaussians.means, times[chosen]).apply(gaussians)
+        selected = to_device_async(frames, device)
+        moved = deformation.displace(gaussians.means, times[selected]).apply(gaussians)
 
         side = reference_size_at(settings, progress)
         camera, color, alpha = references(side)
         rendering = rasterize(moved, [camera] * len(frames), white)
         reference = reference_loss(
             rendering,
-            color[chosen].permute(0, 2, 3, 1),
-            alpha[chosen].permute(0, 2, 3, 1),
+            color[selected].permute(0, 2, 3, 1),
+            alpha[selected].permute(0, 2, 3, 1),
             settings.color_weight,
             settings.alpha_weight,
             settings.ssim_weight,
@@ -179,7 +180,7 @@ def sample_views(
     return views, torch.tensor(rows, dtype=torch.long)
 
 
-def trained(
+def trainable_cloud(
     gaussians: Gaussians, deformation: Deformation, settings: MotionSettings
 ) -> tuple[Gaussians, list[dict[str, object]]]:
     """Return the canonical cloud, with `settings.fine_tune` a trainable copy of it, and Adam's parameter groups."""
@@ -191,10 +192,10 @@ def trained(
     return copy, [*({"params": getattr(copy, name), "lr": rate} for name, rate in rates), *groups]
 
 
-def bounds_of(gaussians: Gaussians, margin: float = 0.1) -> Float[Tensor, "2 3"]:
-    """Return the bounding box of the means, widened by a fraction of its longest side: the box of a deformation."""
+def bounds_of(gaussians: Gaussians) -> Float[Tensor, "2 3"]:
+    """Return the bounding box of the means, widened by `MARGIN`: the box of a deformation."""
     low, high = gaussians.means.detach().amin(0), gaussians.means.detach().amax(0)
-    slack = margin * (high - low).max().clamp(min=1e-3)
+    slack = MARGIN * (high - low).max().clamp(min=1e-3)
     return torch.stack([low - slack, high + slack])
 
 

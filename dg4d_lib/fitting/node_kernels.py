@@ -9,13 +9,10 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
 

@@ -21,7 +21,7 @@ from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 SMALLEST_REAL = 0.05  # part of a quaternion: turns by half a circle have no vector
 BETA1, BETA2 = 0.9, 0.99  # of Adam
-FACTORS = {"turns": 6.0, "shifts": 3.0, "whole_turns": 2.0, "whole_shifts": 1.0}  # of the learning rate, per variable
+FACTORS = {"turns": 6.0, "shifts": 3.0, "global_turns": 2.0, "global_shifts": 1.0}  # of the learning rate, per variable
 INTEGRATED_FACTORS = FACTORS | {"turns": 24.0, "shifts": 1.5}  # likewise, where rotations are integrated
 
 
@@ -32,14 +32,14 @@ class NodeMotion:
     Attributes:
         quats: rotations of the nodes, wxyz, any norm from 1e-10 to 1e18.
         shifts: translations of the nodes.
-        whole_quats: rotation of everything about the centroid of the nodes.
-        whole_shifts: translation of everything.
+        global_quats: rotation of the whole model about the centroid of the nodes.
+        global_shifts: translation of the whole model.
     """
 
     quats: Float[Tensor, "t m 4"]
     shifts: Float[Tensor, "t m 3"]
-    whole_quats: Float[Tensor, "t 4"]
-    whole_shifts: Float[Tensor, "t 3"]
+    global_quats: Float[Tensor, "t 4"]
+    global_shifts: Float[Tensor, "t 3"]
 
     @property
     def parts(self) -> Int[Tensor, " m"]:
@@ -49,7 +49,9 @@ class NodeMotion:
 
     def at(self, frames: slice | Int[Tensor, " k"]) -> "NodeMotion":
         """Return the motion of some frames."""
-        return NodeMotion(self.quats[frames], self.shifts[frames], self.whole_quats[frames], self.whole_shifts[frames])
+        return NodeMotion(
+            self.quats[frames], self.shifts[frames], self.global_quats[frames], self.global_shifts[frames]
+        )
 
     @cached_property
     def matrices(self) -> Float[Tensor, "t m 3 3"]:
@@ -57,8 +59,8 @@ class NodeMotion:
         return quat_to_rotmat(self.quats)
 
     @cached_property
-    def _whole_matrices(self) -> Float[Tensor, "t 3 3"]:
-        return quat_to_rotmat(self.whole_quats)
+    def _global_matrices(self) -> Float[Tensor, "t 3 3"]:
+        return quat_to_rotmat(self.global_quats)
 
     def points(self, rest: Float[Tensor, "v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
         """Return the points that the nodes of `graph` move, at every frame."""
@@ -77,13 +79,13 @@ class NodeMotion:
     def rotations(self, graph: ControlGraph) -> Float[Tensor, "t v 4"]:
         """Return the blended rotations of the points, unit quaternions."""
         blended = graph.blend_rotations(functional.normalize(self.quats, dim=-1))
-        whole = functional.normalize(self.whole_quats, dim=-1)
-        return quat_multiply(whole[:, None].expand_as(blended), blended)
+        turn = functional.normalize(self.global_quats, dim=-1)
+        return quat_multiply(turn[:, None].expand_as(blended), blended)
 
     def _placed(self, points: Float[Tensor, "t v 3"], graph: ControlGraph) -> Float[Tensor, "t v 3"]:
         center = graph.nodes.mean(0)
-        turned = (points - center) @ self._whole_matrices.mT
-        return turned + center + self.whole_shifts[:, None]
+        turned = (points - center) @ self._global_matrices.mT
+        return turned + center + self.global_shifts[:, None]
 
 
 class NodeBasis:
@@ -102,7 +104,7 @@ class NodeBasis:
         self._integral = _integral(graph) if integrated else None
 
     def integral(self, quats: Float[Tensor, "t m 4"]) -> Float[Tensor, "t m 3"]:
-        """Return the shifts, mean 0, that turn every edge as its ends turn, in least squares; 0 if not integrated."""
+        """Return the shifts, mean 0, that rotate every edge with its ends, by least squares; 0 if not integrated."""
         if self._integral is None:
             return torch.zeros_like(quats[..., 1:])
         if has_kernels(quats):
@@ -114,41 +116,41 @@ class NodeBasis:
 
 @dataclass(frozen=True)
 class NodeVariables(FrameVariables):
-    """Transforms of the nodes and of the whole before smoothing, rotations as vectors.
+    """Transforms of the nodes and of the whole model before smoothing, rotations as vectors.
 
     Attributes:
         turns: along the axis, of twice the tangent of half the angle.
         shifts: world units.
-        whole_turns: like `turns`, of everything.
-        whole_shifts: like `shifts`, of everything.
+        global_turns: like `turns`, for the whole model.
+        global_shifts: like `shifts`, for the whole model.
     """
 
     turns: Float[Tensor, "t m 3"]
     shifts: Float[Tensor, "t m 3"]
-    whole_turns: Float[Tensor, "t 3"]
-    whole_shifts: Float[Tensor, "t 3"]
+    global_turns: Float[Tensor, "t 3"]
+    global_shifts: Float[Tensor, "t 3"]
 
     @classmethod
     def still(cls, frames: int, graph: ControlGraph) -> "NodeVariables":
         """Return the variables of nodes at rest."""
-        zeros, whole = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
-        return cls(zeros, zeros, whole, whole)
+        zeros, still = graph.nodes.new_zeros(frames, len(graph.nodes), 3), graph.nodes.new_zeros(frames, 3)
+        return cls(zeros, zeros, still, still)
 
     @classmethod
     def of(cls, pose: Pose, basis: NodeBasis) -> "NodeVariables":
         """Return the variables of a tracked pose."""
         quats = pose.quats()
         turns = 2 * quats[:, 1:] / quats[:, :1].clamp(min=SMALLEST_REAL)
-        shifts, whole = torch.from_numpy(pose.shifts).to(turns), turns.new_zeros(1, 3)
+        shifts, still = torch.from_numpy(pose.shifts).to(turns), turns.new_zeros(1, 3)
         remaining = shifts - basis.integral(quats[None])[0]
         rough = [torch.linalg.solve(basis.smoothing, one)[None] for one in (turns, remaining)]
-        return cls(rough[0], rough[1], whole, whole)
+        return cls(rough[0], rough[1], still, still)
 
     def motion(self, basis: NodeBasis) -> NodeMotion:
-        """Return the motion of nodes and whole."""
+        """Return the motion of the nodes and of the whole model."""
         quats = _quats(basis.smoothing @ self.turns)
         shifts = basis.smoothing @ self.shifts + basis.integral(quats)
-        return NodeMotion(quats, shifts, _quats(self.whole_turns), self.whole_shifts)
+        return NodeMotion(quats, shifts, _quats(self.global_turns), self.global_shifts)
 
 
 class Descent:

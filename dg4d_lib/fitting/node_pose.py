@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-CONTINUED = 0.5  # of the last motion, in the extrapolation
+CONTINUED = 0.5  # share of the last motion that is extrapolated
 
 Turns = Float[np.ndarray, "m 3 3"]
 Shifts = Float[np.ndarray, "m 3"]

@@ -7,12 +7,9 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.linalg import cho_factor, cho_solve
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 UNKNOWNS = 6  # of a node: rotation vector and translation
 DAMPING = 1e-9  # added to the diagonal, for nodes that no residual depends on

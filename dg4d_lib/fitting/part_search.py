@@ -28,17 +28,17 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 SIZE = 64  # pixels of the compared pictures, at most
 RENDERED = 1000  # largest number of Gaussians, about
 BATCH = 64  # pictures at once
-LEVELS = 3  # of the pyramid that compares them
-BRANCHES = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # shares of the nodes nearer to the middle than a branch
+LEVELS = 3  # of the image pyramid
+BRANCHES = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of the distance from the middle where branches begin
 CLUSTERS = (2, 4, 6, 9, 12)  # numbers of clusters
-SMALLEST, LARGEST = 3, 0.65  # nodes of a part, and share of all nodes
+SMALLEST, LARGEST = 3, 0.65  # least number of nodes of a part, and its largest share of all nodes
 SAME = 0.85  # IoU from which two parts are one
-ANGLES = (15.0, 35.0, 65.0, 105.0)  # degrees
+ANGLES = (15.0, 35.0, 65.0, 105.0)  # trial rotations, degrees
 FINER = (12.0, 6.0)  # degrees of the steps that refine a rotation
 REFINED = 6  # parts whose best rotation is refined, per round
 ROUNDS = 3  # parts that are turned one after the other, at most
-PENALTY = 0.2  # of half a turn, times the error before
-GAIN = 0.05  # by which a part must lower the error
+PENALTY = 0.2  # penalty on a rotation by 180 degrees, relative to the error before
+GAIN = 0.05  # least relative decrease of the error by a part
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Part:
 
 @dataclass(frozen=True)
 class _Hinge:
-    """A part as it lies, with the center of its joint and, as rows, the main directions of that."""
+    """A part in its present pose, with the center of its joint and, as rows, the principal axes of the joint."""
 
     nodes: Bool[np.ndarray, " m"]
     center: Float[np.ndarray, " 3"]
@@ -111,9 +111,9 @@ class PartSearch:
         self._frames = functional.interpolate(frames, size=(size, size), mode="area")
         self._nodes = graph.nodes.double().numpy()
         self._parts = find_parts(graph)
-        self._turns = np.concatenate([_around(angle) for angle in ANGLES])
+        self._turns = np.concatenate([_rotations_by(angle) for angle in ANGLES])
 
-    def posed(self, pose: Pose, frame: int) -> Pose:
+    def best_pose(self, pose: Pose, frame: int) -> Pose:
         """Return the pose after up to `ROUNDS` parts were turned; the same object if no part lowers the error."""
         everything = np.ones(len(self._nodes), bool)
         still = _Hinge(everything, self._nodes.mean(0), np.eye(3))
@@ -125,15 +125,16 @@ class PartSearch:
             costs = [costs_of(hinge, self._turns) for hinge in hinges]
             promising = np.argsort([cost.min() for cost in costs], kind="stable")[:REFINED]
             refined = [
-                (*_refined(partial(costs_of, hinges[k]), self._turns[int(costs[k].argmin())]), k) for k in promising
+                (*_refine_rotation(partial(costs_of, hinges[k]), self._turns[int(costs[k].argmin())]), k)
+                for k in promising
             ]
-            cost, turn, chosen = min(refined, key=lambda one: one[0])
+            cost, turn, selected = min(refined, key=lambda one: one[0])
             if cost > (1 - GAIN) * best:
                 break
-            best, pose = cost, self._turned(pose, hinges[chosen], turn)
+            best, pose = cost, self._turn_part(pose, hinges[selected], turn)
         return pose
 
-    def _turned(self, pose: Pose, hinge: _Hinge, turn: Float[np.ndarray, "3 3"]) -> Pose:
+    def _turn_part(self, pose: Pose, hinge: _Hinge, turn: Float[np.ndarray, "3 3"]) -> Pose:
         """Return a pose with a part turned about its joint, by a rotation in the hinge's directions."""
         turn = hinge.directions.T @ turn @ hinge.directions
         turns, shifts, own = pose.turns.copy(), pose.shifts.copy(), hinge.nodes
@@ -155,7 +156,7 @@ class PartSearch:
         return self._errors(shares, frame, hinge, turns) + PENALTY * scale * np.square(angles / np.pi)
 
     def _shares(self, pose: Pose) -> Float[np.ndarray, "n k 3"]:
-        """Return what each of its nodes adds to the mean of every Gaussian."""
+        """Return the contribution of each of its nodes to the mean of every Gaussian."""
         index, weights = self._graph.indices.numpy(), self._graph.weights.double().numpy()
         return pose.shares(self._cloud.means.double().numpy(), self._nodes, index, weights)[0]
 
@@ -177,18 +178,20 @@ class PartSearch:
                 log_scales=self._cloud.log_scales.expand(count, -1, -1),
                 quats=self._cloud.quats.expand(count, -1, -1),
             )
-            drawn = self._rasterize(states, [self._camera] * count, self._backdrop)
-            errors.append(_pyramid(torch.cat([drawn.color, drawn.alpha], -1).movedim(-1, 1) - self._frames[frame]))
+            rendering = self._rasterize(states, [self._camera] * count, self._backdrop)
+            errors.append(
+                _pyramid(torch.cat([rendering.color, rendering.alpha], -1).movedim(-1, 1) - self._frames[frame])
+            )
         return torch.cat(errors).double().numpy()
 
 
-def _refined(
+def _refine_rotation(
     costs_of: Callable[[Float[np.ndarray, "b 3 3"]], Float[np.ndarray, " b"]], turn: Float[np.ndarray, "3 3"]
 ) -> tuple[float, Float[np.ndarray, "3 3"]]:
     """Return the cost and the best of the rotations near one."""
     best = np.inf
     for angle in FINER:
-        near = np.concatenate([turn[None], _around(angle) @ turn])
+        near = np.concatenate([turn[None], _rotations_by(angle) @ turn])
         costs = costs_of(near)
         best, turn = float(costs.min()), near[int(costs.argmin())]
     return best, turn
@@ -200,7 +203,7 @@ def _hinge(part: Part, places: Float[np.ndarray, "m 3"]) -> _Hinge:
     return _Hinge(part.nodes, center, np.linalg.svd(at - center)[2])
 
 
-def _around(angle: float) -> Turns:
+def _rotations_by(angle: float) -> Turns:
     """Return rotations by an angle in degrees about 26 axes, along sides and diagonals of a cube."""
     axes = np.array([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)])
     return rotation(np.deg2rad(angle) * axes / np.linalg.norm(axes, axis=1, keepdims=True))

@@ -18,14 +18,14 @@ from dg4d_lib.fitting.rigid_parts import RigidMotion
 from dg4d_lib.fitting.rigidity import robust
 from dg4d_lib.geometry.quaternion import rotate
 
-ITERATIONS = 24  # at most
+ITERATIONS = 24  # largest number
 SHIFT, SHIFT_IN_DEPTH, TURN = 0.001, 0.0025, 0.002  # forward differences, world units; turns at the radius of a part
 SMALLEST_RADIUS = 0.03  # world units
-FARTHEST, WIDEST = 0.1, 0.4  # world units and radians that a part moves in one step
-DAMPING, LESS, MORE = 1e-3, 0.3, 6.0  # of the first step, relative to the diagonal; factors after success and failure
-INERTIA, JOINTS = 0.1, 0.1  # of the weights of accelerations and rigidity: rigid parts jump, and lids lift off
+FARTHEST, WIDEST = 0.1, 0.4  # largest step of a part, world units and radians
+DAMPING, LESS, MORE = 1e-3, 0.3, 6.0  # relative to the diagonal at first; factors after success and failure
+INERTIA, JOINTS = 0.1, 0.1  # factors on acceleration and rigidity weights: parts may move abruptly, lids lift off
 SMALLEST_DAMPING, TRIES = 1e-5, 5
-SMALLEST_GAIN = 0.01  # of the loss by one step; below, the fit ends
+SMALLEST_GAIN = 0.01  # relative decrease of the loss by one step, below which the fit ends
 TOGETHER = 8  # frames whose derivatives are held in memory
 
 
@@ -54,7 +54,7 @@ def fit_rigid_motion(
                 damped = matrix + torch.diag(damping * matrix.diagonal() + 1e-8)
                 change = torch.zeros_like(gradient)
                 change[held:] = -torch.linalg.solve(damped[held:, held:], gradient[held:])
-                candidate = found.changed(_limited(change.view(*found.quats.shape[:2], 6).to(found.places)))
+                candidate = found.changed(_limit_steps(change.view(*found.quats.shape[:2], 6).to(found.places)))
                 loss = problem.loss(candidate)
                 if loss < before:
                     found, damping = candidate, max(LESS * damping, SMALLEST_DAMPING)
@@ -80,7 +80,8 @@ class _Problem:
         """Return the sum of the squares."""
         total = float((self._inertia * self._nodes(motion).diff(n=2, dim=0)).square().sum())
         return total + sum(
-            float(self._residuals(motion.at(chosen), chosen).square().sum()) for chosen in self._pieces(motion)
+            float(self._residuals(motion.at(selected), selected).square().sum())
+            for selected in self._frame_chunks(motion)
         )
 
     def normal_equations(self, motion: RigidMotion) -> tuple[Float64[Tensor, "n n"], Float64[Tensor, " n"]]:
@@ -92,14 +93,14 @@ class _Problem:
         stiffness = accelerate.T @ accelerate  # couples the frames
         coupled = torch.einsum("tu,tin,uim->tnum", stiffness, moves, moves)
         gradient = torch.einsum("tin,ti->tn", moves, stiffness @ nodes.flatten(1).double())
-        for chosen in self._pieces(motion):
-            piece = motion.at(chosen)
-            residuals = self._residuals(piece, chosen)
-            derivative = self._derivative(piece, partial(self._residuals, frames=chosen))
+        for selected in self._frame_chunks(motion):
+            piece = motion.at(selected)
+            residuals = self._residuals(piece, selected)
+            derivative = self._derivative(piece, partial(self._residuals, frames=selected))
             squares = (derivative.mT @ derivative).double()
-            for frame, square in zip(range(chosen.start, chosen.stop), squares, strict=True):
+            for frame, square in zip(range(selected.start, selected.stop), squares, strict=True):
                 coupled[frame, :, frame] += square
-            gradient[chosen] += (derivative.mT @ residuals[..., None])[..., 0].double()
+            gradient[selected] += (derivative.mT @ residuals[..., None])[..., 0].double()
         return coupled.reshape(frames * count, -1), gradient.reshape(-1)
 
     @property
@@ -110,7 +111,7 @@ class _Problem:
         return self.fit.relative(motion.of_nodes(self.graph).nodes(self.graph))
 
     def _residuals(self, motion: RigidMotion, frames: slice) -> Float[Tensor, "t r"]:
-        """Return what pictures and displacements differ by, and how far the joints come apart, robustly."""
+        """Return the residuals: differences of pictures and displacements, and robust gaps at the joints."""
         moved = motion.of_nodes(self.graph)
         seen = self.fit.residuals(moved, list(range(frames.start, frames.stop)))
         edges, settings = self.graph.edges[self.joints], self.fit.settings
@@ -137,7 +138,7 @@ class _Problem:
         return torch.stack(columns, -1)
 
     @staticmethod
-    def _pieces(motion: RigidMotion) -> list[slice]:
+    def _frame_chunks(motion: RigidMotion) -> list[slice]:
         frames = len(motion.quats)
         return [slice(first, min(first + TOGETHER, frames)) for first in range(0, frames, TOGETHER)]
 
@@ -149,7 +150,7 @@ def _differences(fit: AssetFit, start: RigidMotion, part: int) -> list[float]:
     return [SHIFT, SHIFT, SHIFT_IN_DEPTH, *[TURN / max(float(radius), SMALLEST_RADIUS)] * 3]
 
 
-def _limited(change: Float[Tensor, "t k 6"]) -> Float[Tensor, "t k 6"]:
-    """Return steps, made smaller at frames where a part would move too far."""
+def _limit_steps(change: Float[Tensor, "t k 6"]) -> Float[Tensor, "t k 6"]:
+    """Scale the steps down at frames where a part would move too far."""
     size = torch.maximum(change[..., :3].abs() / FARTHEST, change[..., 3:].abs() / WIDEST).amax((1, 2))
     return change / size.clamp(min=1)[:, None, None]

@@ -18,7 +18,7 @@ from dg4d_lib.fitting.node_motion import NodeMotion
 from dg4d_lib.geometry.quaternion import quat_multiply, quat_to_rotmat, rotate
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
-UNEXPLAINED = 0.15  # of the displacements of the points, root mean square, that rigid parts may leave
+UNEXPLAINED = 0.15  # largest residual of rigid parts relative to the displacements, root mean square
 NEARLY_ONE = 0.9  # share of the weights of a piece of the surface that one part has, above which it has all
 
 
@@ -60,7 +60,7 @@ class RigidMotion:
 def find_rigid_parts(
     motion: NodeMotion, graph: ControlGraph, points: Float[Tensor, "v 3"], most: int
 ) -> RigidMotion | None:
-    """Return the fewest rigid parts whose motions leave little of a motion unexplained.
+    """Return the fewest rigid parts whose motions approximate a motion well.
 
     Args:
         motion: of the nodes.
@@ -77,10 +77,10 @@ def find_rigid_parts(
     owners = torch.cat([torch.arange(len(graph.nodes)).to(strongest), strongest]).numpy(force=True)
     rest = torch.cat([graph.nodes, points]).double().numpy(force=True)
     bound = UNEXPLAINED**2 * np.square(moved - rest).sum()
-    parts = _merged(_Moments.of(rest, moved, owners), graph.edges.numpy(force=True), float(bound))
+    parts = _merge_clusters(_Moments.of(rest, moved, owners), graph.edges.numpy(force=True), float(bound))
     if int(parts.max()) >= most:
         return None
-    return _rigid(parts, _Moments.of(rest, moved, parts[owners]), graph)
+    return _fit_rigid_motion(parts, _Moments.of(rest, moved, parts[owners]), graph)
 
 
 def two_rigid_parts(graph: ControlGraph, moved: Float[Tensor, "t v 3"]) -> RigidMotion | None:
@@ -98,17 +98,17 @@ def two_rigid_parts(graph: ControlGraph, moved: Float[Tensor, "t v 3"]) -> Rigid
     if len(np.unique(owners)) < len(graph.nodes):
         return None
     moments = _Moments.of(there[0], there, owners)
-    parts = _merged(moments, graph.edges.numpy(force=True), math.inf, fewest=2)
+    parts = _merge_clusters(moments, graph.edges.numpy(force=True), math.inf, fewest=2)
     if int(parts.max()) != 1:
         return None
     moves = np.square(there - there[0]).sum(-1).mean(0)
     if moves[parts[owners] == 0].mean() > moves[parts[owners] == 1].mean():
         parts = 1 - parts
-    return _rigid(parts, _Moments.of(there[0], there, parts[owners]), graph)
+    return _fit_rigid_motion(parts, _Moments.of(there[0], there, parts[owners]), graph)
 
 
 def of_one_part(graph: ControlGraph, parts: Int[Tensor, " m"], owners: Int[Tensor, " v"]) -> ControlGraph:
-    """Return a graph by which every point moves with one rigid part alone.
+    """Bind every point to a single rigid part; return the graph with these weights.
 
     Args:
         graph: nodes.
@@ -121,8 +121,8 @@ def of_one_part(graph: ControlGraph, parts: Int[Tensor, " m"], owners: Int[Tenso
     return replace(graph, indices=indices, weights=weights)
 
 
-def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"]) -> ControlGraph:
-    """Return a graph by which pieces of a surface that nearly belong to one rigid part move with it alone.
+def keep_pieces_rigid(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int[Tensor, " v"]) -> ControlGraph:
+    """Bind surface pieces that nearly belong to one rigid part to this part; return the graph with these weights.
 
     They do not bend where parts meet, as a lid does not at its hinge. Pieces of several parts bend as before.
 
@@ -134,12 +134,12 @@ def keep_pieces_whole(graph: ControlGraph, parts: Int[Tensor, " m"], pieces: Int
     shares = (functional.one_hot(parts)[graph.indices] * graph.weights[..., None]).sum(1)
     sums = shares.new_zeros(int(pieces.max()) + 1, shares.shape[1]).index_add_(0, pieces, shares)
     largest, owner = (sums / sums.sum(1, keepdim=True)).max(1)
-    whole = (largest > NEARLY_ONE)[pieces, None]
+    rigid = (largest > NEARLY_ONE)[pieces, None]
     alone = of_one_part(graph, parts, owner[pieces])
     return replace(
         graph,
-        indices=torch.where(whole, alone.indices, graph.indices),
-        weights=torch.where(whole, alone.weights, graph.weights),
+        indices=torch.where(rigid, alone.indices, graph.indices),
+        weights=torch.where(rigid, alone.weights, graph.weights),
     )
 
 
@@ -175,7 +175,7 @@ class _Moments:
             np.add.at(total, clusters, term)
         return cls(*sums)
 
-    def united(self, first: Int[np.ndarray, " p"], second: Int[np.ndarray, " p"]) -> "_Moments":
+    def pair_sums(self, first: Int[np.ndarray, " p"], second: Int[np.ndarray, " p"]) -> "_Moments":
         """Return the sums of pairs of clusters."""
         return _Moments(*(values[first] + values[second] for values in vars(self).values()))
 
@@ -202,7 +202,7 @@ class _Moments:
         return self.cross - outer / self.count[:, None, None, None], self.squares - norms / self.count[:, None]
 
 
-def _rigid(parts: Int[np.ndarray, " m"], moments: _Moments, graph: ControlGraph) -> RigidMotion:
+def _fit_rigid_motion(parts: Int[np.ndarray, " m"], moments: _Moments, graph: ControlGraph) -> RigidMotion:
     """Return the rigid motion of every part that fits its nodes best."""
     turns = Rotation.from_matrix(moments.rotations().reshape(-1, 3, 3)).as_quat(scalar_first=True)
     quats = turns.reshape(len(moments.count), -1, 4).swapaxes(0, 1)
@@ -215,7 +215,9 @@ def _rigid(parts: Int[np.ndarray, " m"], moments: _Moments, graph: ControlGraph)
     )
 
 
-def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float, fewest: int = 1) -> Int[np.ndarray, " m"]:
+def _merge_clusters(
+    moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float, fewest: int = 1
+) -> Int[np.ndarray, " m"]:
     """Merge neighboring clusters while the error of all stays below a bound; return the cluster of every node."""
     values = _Moments(*(array.copy() for array in vars(moments).values()))
     errors = values.errors()
@@ -226,7 +228,7 @@ def _merged(moments: _Moments, edges: Int[np.ndarray, "e 2"], bound: float, fewe
         if pairs:
             first, second = np.array(pairs).T
             costs.update(
-                zip(pairs, values.united(first, second).errors() - errors[first] - errors[second], strict=True)
+                zip(pairs, values.pair_sums(first, second).errors() - errors[first] - errors[second], strict=True)
             )
 
     compare(sorted({(min(pair), max(pair)) for pair in edges.tolist()}))

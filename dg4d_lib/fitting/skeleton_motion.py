@@ -31,37 +31,37 @@ from dg4d_lib.video.driving import DrivingVideo
 
 ADVICE = "set asset.skeleton to false"
 COARSE = 64  # pixels of the compared pictures in a search
-POINTS = 4000  # Gaussians of it
-RATES = (0.06, 0.02, 0.007)  # of the search: far poses need large steps, and near ones are lost by them
+POINTS = 4000  # Gaussians in a search
+RATES = (0.06, 0.02, 0.007)  # learning rates of the search: distant poses need large steps, near ones small steps
 SEARCHED, FINISHED = 100, 40  # iterations at the first frame, coarse and fine
-TRACKED, TRUED = 30, 12  # likewise at every other frame
-FINER, TRACKING = 0.01, 0.02  # rates of the finer steps at the first frame and at all, and while tracking
-FACTORS = {"turns": 2.0, "whole_turn": 0.5, "whole_shift": 0.2, "whole_depth": 0.4}  # of the rates
-EVENNESS = 0.5  # of the steps of all joints: 1 leaves weak gradients weak, 0 makes them as strong as others
+TRACKED, TRUED = 30, 12  # the same at every other frame
+FINER, TRACKING = 0.01, 0.02  # learning rates of the fine descents, and of the coarse ones while tracking
+FACTORS = {"turns": 2.0, "global_turn": 0.5, "global_shift": 0.2, "global_depth": 0.4}  # on the learning rates
+EVENNESS = 0.5  # of the step sizes of joints: 1 keeps the ratios of gradients, 0 normalizes each joint
 AT_REST, AS_BEFORE = 0.002, 0.002  # weights of rotations, and of their changes while tracking
-WHOLE_DEPTH = 0.15  # weight of the depth of the whole in a video, as of other descents
+WHOLE_DEPTH = 0.15  # least weight of `whole_depth` for videos, as in other descents
 STEADY = 0.01  # weight of accelerations of the rotations
-CONTINUED = 0.7  # share of the last motion that goes on
+CONTINUED = 0.7  # share of the last motion that is extrapolated
 Report = Callable[[int, dict[str, float]], None]
 
 
 @dataclass(frozen=True)
 class JointVariables(FrameVariables):
-    """Rotations of joints relative to their parents, and motion of the whole about the first node.
+    """Rotations of joints relative to their parents, and motion of the whole model about the first node.
 
     Rotations are vectors along the axis of twice the tangent of half the angle.
 
     Attributes:
         turns: of the nodes; unused for the first one.
-        whole_turn: rotation of everything.
-        whole_shift: translation of everything to the right and up.
-        whole_depth: translation of everything towards the camera; for itself, since a step shows less.
+        global_turn: rotation of the whole model.
+        global_shift: translation of the whole model to the right and up.
+        global_depth: translation of the whole model towards the camera; separate, since a step shows less.
     """
 
     turns: Float[Tensor, "t m 3"]
-    whole_turn: Float[Tensor, "t 3"]
-    whole_shift: Float[Tensor, "t 2"]
-    whole_depth: Float[Tensor, "t 1"]
+    global_turn: Float[Tensor, "t 3"]
+    global_shift: Float[Tensor, "t 2"]
+    global_depth: Float[Tensor, "t 1"]
 
     @classmethod
     def still(cls, joints: JointGraph) -> "JointVariables":
@@ -71,9 +71,9 @@ class JointVariables(FrameVariables):
 
     @property
     def posture(self) -> "JointVariables":
-        """The same rotations, of a model that stays in its place."""
+        """The same rotations without a translation of the model."""
         return replace(
-            self, whole_shift=torch.zeros_like(self.whole_shift), whole_depth=torch.zeros_like(self.whole_depth)
+            self, global_shift=torch.zeros_like(self.global_shift), global_depth=torch.zeros_like(self.global_depth)
         )
 
 
@@ -92,20 +92,20 @@ class JointChains:
         self.back = torch.from_numpy(place)  # of every node, where it is found
         self.levels: list[tuple[Tensor, Tensor]] = []  # nodes, and a matrix that picks their parents from all before
         for level in range(1, depth.max() + 1):
-            chosen = order[depth[order] == level]
-            picked = np.eye(int((depth < level).sum()), dtype=np.float32)[place[parents[chosen]]]
-            self.levels.append((torch.from_numpy(chosen), torch.from_numpy(picked)))
+            selected = order[depth[order] == level]
+            picked = np.eye(int((depth < level).sum()), dtype=np.float32)[place[parents[selected]]]
+            self.levels.append((torch.from_numpy(selected), torch.from_numpy(picked)))
 
     def motion(self, variables: JointVariables) -> NodeMotion:
         """Return the motion of the nodes."""
         local = _quats(variables.turns * self.turning)
-        quats = _quats(variables.whole_turn)[:, None]
-        places = (self.nodes[0] + torch.cat([variables.whole_shift, variables.whole_depth], -1))[:, None]
-        for chosen, picked in self.levels:
+        quats = _quats(variables.global_turn)[:, None]
+        places = (self.nodes[0] + torch.cat([variables.global_shift, variables.global_depth], -1))[:, None]
+        for selected, picked in self.levels:
             above = picked @ quats
-            spans = rotate(quat_to_rotmat(above), self.spans[chosen])
+            spans = rotate(quat_to_rotmat(above), self.spans[selected])
             places = torch.cat([places, picked @ places + spans], 1)
-            quats = torch.cat([quats, quat_multiply(above, local[:, chosen])], 1)
+            quats = torch.cat([quats, quat_multiply(above, local[:, selected])], 1)
         still = quats.new_tensor((1.0, 0, 0, 0)).expand(len(quats), 4)
         shifts = places[:, self.back] - self.nodes
         return NodeMotion(quats[:, self.back], shifts, still, torch.zeros_like(shifts[:, 0]))
@@ -139,9 +139,9 @@ def fit_skeleton_motion(
     poses = [search.first_pose()]
     for frame in range(1, len(video)):
         start = poses[-1] if frame == 1 else poses[-2].continued(poses[-1], CONTINUED)
-        rough, _ = search.descended(search.coarse, start, frame, TRACKED, TRACKING, steady=True)
-        poses.append(search.descended(search.fine, rough, frame, TRUED, FINER, steady=True)[0])
-    return search.together(JointVariables.joined(poses), generator)
+        rough, _ = search.descend(search.coarse, start, frame, TRACKED, TRACKING, steady=True)
+        poses.append(search.descend(search.fine, rough, frame, TRUED, FINER, steady=True)[0])
+    return search.refine_jointly(JointVariables.joined(poses), generator)
 
 
 def skeleton_iterations(settings: AssetSettings, frames: int) -> int:
@@ -197,8 +197,8 @@ def pose_model(
     outline = search.fine.silhouettes(motion)[0]
     both, either = outline & (search.fine.alphas[0] > 0.5), outline | (search.fine.alphas[0] > 0.5)
     center = joints.graph.nodes[0]
-    nearer = float((RADIUS - center[2]) / (RADIUS - center[2] - pose.whole_depth[0, 0]).clamp(min=0.1))
-    goal = torch.cat([(center[:2] + pose.whole_shift[0]) * nearer, center[2:]])
+    nearer = float((RADIUS - center[2]) / (RADIUS - center[2] - pose.global_depth[0, 0]).clamp(min=0.1))
+    goal = torch.cat([(center[:2] + pose.global_shift[0]) * nearer, center[2:]])
     found = replace(
         placement,
         scale=placement.scale * nearer,
@@ -233,11 +233,11 @@ class _Search:
     def first_pose(self) -> JointVariables:
         """Return the pose at the first frame."""
         still = JointVariables.still(self.joints)
-        found = [self.descended(self.coarse, still, 0, SEARCHED, rate) for rate in RATES]
+        found = [self.descend(self.coarse, still, 0, SEARCHED, rate) for rate in RATES]
         start = min(found, key=lambda one: one[1])[0]
-        return self.descended(self.fine, start, 0, FINISHED, FINER)[0]
+        return self.descend(self.fine, start, 0, FINISHED, FINER)[0]
 
-    def descended(
+    def descend(
         self,
         fit: AssetFit,
         start: JointVariables,
@@ -246,7 +246,7 @@ class _Search:
         rate: float,
         steady: bool = False,
     ) -> tuple[JointVariables, float]:
-        """Descend from a start; also return the loss of the pictures. With `steady`, changes cost something."""
+        """Descend from a start; also return the picture loss. With `steady`, changes of rotations are penalized."""
         variables = start.trainable()
         descent = Descent(vars(variables), FACTORS, evenness=EVENNESS)
         loss = float("inf")
@@ -259,15 +259,15 @@ class _Search:
             descent.step(rate * (1 - 0.9 * step / iterations))
         return variables.detach(), loss
 
-    def together(self, start: JointVariables, generator: torch.Generator) -> NodeMotion:
+    def refine_jointly(self, start: JointVariables, generator: torch.Generator) -> NodeMotion:
         """Refine all frames together."""
         variables, frames, iterations = start.trainable(), len(start.turns), self.settings.joint_iterations
         descent = Descent(vars(variables), FACTORS, evenness=EVENNESS)
         for step in range(iterations):
             count = min(self.settings.joint_frames, frames)
-            chosen = torch.randperm(frames, generator=generator)[:count].sort().values
+            selected = torch.randperm(frames, generator=generator)[:count].sort().values
             motion = self.chains.motion(variables)
-            losses = self._losses(self.fine, motion.at(chosen), variables, chosen.tolist())
+            losses = self._losses(self.fine, motion.at(selected), variables, selected.tolist())
             if frames > 2:
                 acceleration = self.fine.relative(motion.nodes(self.fine.graph).diff(n=2, dim=0)).square()
                 turning = variables.turns.diff(n=2, dim=0).square()
@@ -283,7 +283,7 @@ class _Search:
         self, fit: AssetFit, motion: NodeMotion, variables: JointVariables, frames: list[int]
     ) -> dict[str, Tensor]:
         posture = self.chains.motion(variables.posture)
-        nearer = self.whole_depth * fit.relative(variables.whole_depth).square().mean()
+        nearer = self.whole_depth * fit.relative(variables.global_depth).square().mean()
         bent = AT_REST * variables.turns.square().sum(-1).mean()
         return {**fit.picture_losses(motion, frames), "unseen": fit.unseen(posture) + nearer, "bending": bent}
 

@@ -66,12 +66,14 @@ class Gaussians:
         return Gaussians(**{name: value.to(target) for name, value in vars(self).items()})
 
     def states(self, rows: Sequence[int] | Int[Tensor, " m"]) -> "Gaussians":
-        """Return some states of a batch in this order; the cloud itself if they are all, in order."""
-        chosen = torch.as_tensor(rows, dtype=torch.long)
-        if chosen.tolist() == list(range(len(self.means))):
+        """Return these states of a batch in this order; the cloud itself if they are all states in their order."""
+        selected = torch.as_tensor(rows, dtype=torch.long)
+        if selected.tolist() == list(range(len(self.means))):
             return self
-        chosen = to_device_async(chosen, self.means.device)
-        return replace(self, means=self.means[chosen], log_scales=self.log_scales[chosen], quats=self.quats[chosen])
+        selected = to_device_async(selected, self.means.device)
+        return replace(
+            self, means=self.means[selected], log_scales=self.log_scales[selected], quats=self.quats[selected]
+        )
 
     def subset(self, rows: slice | Int[Tensor, " m"] | Bool[Tensor, " n"]) -> "Gaussians":
         """Return some Gaussians of a cloud of one state."""

@@ -72,7 +72,7 @@ def densify(
         grad2d: mean screen-space gradient norm, NDC.
         min_grad2d: threshold of densification.
         max_scale: world units; larger Gaussians are split in two, smaller ones cloned.
-        room: number of Gaussians that may be added; those with the largest gradients are chosen first.
+        room: number of Gaussians that may be added; those with the largest gradients come first.
         generator: draws the positions of split Gaussians.
     """
     selected = grad2d >= min_grad2d

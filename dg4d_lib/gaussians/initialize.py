@@ -20,7 +20,7 @@ def blob(count: int, radius: float, generator: torch.Generator) -> Gaussians:
     """Return gray Gaussians, uniform in a ball, scaled by the RMS distance of their three nearest neighbors.
 
     Args:
-        count: number of Gaussians.
+        count: number of Gaussians, at least 2.
         radius: of the ball, world units.
         generator: draws the means.
     """

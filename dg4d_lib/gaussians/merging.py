@@ -1,4 +1,4 @@
-"""Fewer Gaussians that look alike: neighbors of similar color are merged, pair by pair (Ward 1963)."""
+"""Simplification of clouds: neighboring Gaussians of similar color are merged pair by pair (Ward 1963)."""
 
 import math
 from dataclasses import replace
@@ -7,24 +7,26 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.transform import concatenate
+from dg4d_lib.kernels.compiling import njit
 
-NEIGHBORS = 6  # of a Gaussian that it may be merged with in a round
+NEIGHBORS = 6  # merge candidates of a Gaussian in a round
 VISIBLE = 1 / 255  # opacity below which a Gaussian is not drawn
 COLOR = 0.1  # difference in color, in [0, 1], that counts as much as `DISTANCE`
-DISTANCE = 1 / 60  # of the cloud's radius
+DISTANCE = 1 / 60  # share of the cloud's radius
 KNUD_THOMSEN = 1.6075  # exponent in the approximate surface area of ellipsoids
 HIGHEST_OPACITY = 0.995
-PAIRS = 0.4  # in a round, for each Gaussian, at most; the last ones would be of different colors
+PAIRS = 0.4  # largest number of pairs per Gaussian in a round; later ones would mix different colors
 LARGEST_SCALE, LARGEST_LOGIT = 40.0, 20.0  # logarithm of the model's units, and logit: files hold any number
 THINNEST = 1e-12  # variance of a pair across a disc, of the sum of its variances, at least
-JITTER = 1e-10  # of the largest coordinate, or of 1: many Gaussians at one place would all have the same neighbors
+JITTER = (
+    1e-10  # relative to the largest coordinate: separates coincident Gaussians, which would all have the same neighbors
+)
 
 
 def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
@@ -41,7 +43,7 @@ def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:
     if len(cloud) <= most:
         return cloud
     visible = torch.nonzero(cloud.opacities >= VISIBLE)[:, 0]
-    if len(visible) < most:  # a cloud that is hardly there keeps its most visible ones
+    if len(visible) < most:  # a nearly transparent cloud keeps its most visible Gaussians
         visible = cloud.opacities.topk(most).indices.sort().values
     given, cloud = cloud.means.dtype, cloud.subset(visible).to(torch.float64)
     cloud = replace(
@@ -87,8 +89,8 @@ def _cheapest_pairs(cloud: Gaussians, radius: float, most: int) -> tuple[Int[Ten
     distance = np.square(points[first] - points[second]).sum(1) / (DISTANCE * radius) ** 2
     difference = np.square(colors[first] - colors[second]).sum(1) / COLOR**2
     order = np.argsort(spread * (distance + difference), kind="stable")
-    chosen = order[_disjoint(first[order], second[order], count, min(most, math.ceil(PAIRS * count)))]
-    return torch.from_numpy(first[chosen]), torch.from_numpy(second[chosen])
+    selected = order[_disjoint(first[order], second[order], count, min(most, math.ceil(PAIRS * count)))]
+    return torch.from_numpy(first[selected]), torch.from_numpy(second[selected])
 
 
 @njit(cache=True)
@@ -96,17 +98,17 @@ def _cheapest_pairs(cloud: Gaussians, radius: float, most: int) -> tuple[Int[Ten
 def _disjoint(first, second, count, most):
     """Return the places of pairs, in order, that share no member with an earlier one."""
     taken = np.zeros(count, np.bool_)
-    chosen = np.empty(most, np.int64)
+    selected = np.empty(most, np.int64)
     found = 0
     for place in range(len(first)):
         a, b = first[place], second[place]
         if not (taken[a] or taken[b]):
             taken[a] = taken[b] = True
-            chosen[found] = place
+            selected[found] = place
             found += 1
             if found == most:
                 break
-    return chosen[:found]
+    return selected[:found]
 
 
 def _merge(first: Gaussians, second: Gaussians) -> Gaussians:

@@ -29,7 +29,8 @@ COLUMNS = (*MEANS, *NORMALS, *COLORS, *OPACITY, *SCALES, *QUATS)
 MAX_HEADER = 65536  # bytes; bounds the search for `end_header`
 _HEADER = re.compile(rb"ply\r?\n(.*?)end_header\r?\n", re.DOTALL)
 _TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
-_TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "short": "<i2", "ushort": "<u2", "char": "i1"}
+_TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "char": "i1", "int8": "i1"}
+_TYPES |= {"short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2"}
 
 
 def write_ply(path: Path, gaussians: Gaussians, *, y_down: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Gaussians that tear away from the subject while it moves, and float beside it as specks."""
+"""Detection of stray Gaussians, which separate from the subject while it moves and float beside it as specks."""
 
 from collections.abc import Iterable
 
@@ -14,14 +14,14 @@ from torch import Tensor
 from dg4d_lib.gaussians.cloud import Gaussians
 
 EXTENT = 2.0  # standard deviations along the longest axis, to which a Gaussian is seen
-GAP = 0.06  # between the extents of neighbors that belong together, at most; world units
-FEW = 5  # Gaussians that belong together, from which they are a piece of the subject
-NEIGHBORS = 16  # of a Gaussian that it may belong to; more than `FEW`
+GAP = 0.06  # largest gap between the extents of connected neighbors, world units
+FEW = 5  # size from which a cluster is a piece of the subject
+NEIGHBORS = 16  # candidates of a Gaussian for links; more than `FEW`
 MOST = 0.01  # share of strays; where more come off, the cloud is sparse, or the subject falls to pieces
 
 
 def find_strays(states: Iterable[Gaussians]) -> Bool[Tensor, " n"]:
-    """Find Gaussians that are apart from all but a few others at some frames, though not at all of them.
+    """Find Gaussians that are far from all but a few others at some frames, but not at all frames.
 
     What is apart at every frame is a piece of the subject, however small.
 

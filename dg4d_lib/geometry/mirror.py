@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-POINTS = 1000  # that are mirrored, at most
+POINTS = 1000  # largest number of mirrored points
 STEP_DEG, FINE_DEG = 4.0, 1.0  # steps of the search of the azimuth, coarse and fine
 OFFSETS = np.linspace(-0.1, 0.1, 13)  # of the plane from the median, in units of the extent
-FAR = 0.04  # of the extent: distance from which a mirrored point has no partner
-SYMMETRIC = 0.9  # of the median error over all azimuths, below which there is a mirror plane
-APART_DEG, CLEARLY = 30.0, 1.1  # angle from which a plane is another one, and by how much it must be worse
+FAR = 0.04  # distance from which a mirrored point counts as unmatched, share of the extent
+SYMMETRIC = 0.9  # error relative to the median over all azimuths, below which there is a mirror plane
+APART_DEG, CLEARLY = 30.0, 1.1  # angle from which planes are distinct, and the least ratio of their errors
 
 
 def mirror_normal(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"] | None:
@@ -28,8 +28,8 @@ def mirror_normal(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"] |
     best = coarse[int(errors.argmin())]
     turn = np.abs(coarse - best)
     others = np.where(np.minimum(turn, 180 - turn) >= APART_DEG, errors, np.inf)
-    azimuth, error = _refined(points, best)
-    _, other = _refined(points, coarse[int(others.argmin())])
+    azimuth, error = _refine_azimuth(points, best)
+    _, other = _refine_azimuth(points, coarse[int(others.argmin())])
     if error >= min(SYMMETRIC * float(np.median(errors)), other / CLEARLY):
         return None
     normal = _horizontal(azimuth)
@@ -54,12 +54,12 @@ def mirror_errors(points: Float[np.ndarray, "n 3"], azimuths_deg: Float[np.ndarr
         places = points @ normal
         offsets = np.median(places) + OFFSETS * extent
         mirrored = points - 2 * (places - offsets[:, None])[..., None] * normal
-        distances = tree.query(mirrored)[0] / (FAR * extent)
+        distances = tree.query(mirrored, distance_upper_bound=FAR * extent)[0] / (FAR * extent)  # infinite if farther
         errors[number] = np.minimum(distances, 1).mean(1).min()
     return errors
 
 
-def _refined(points: Float[np.ndarray, "n 3"], azimuth_deg: float) -> tuple[float, float]:
+def _refine_azimuth(points: Float[np.ndarray, "n 3"], azimuth_deg: float) -> tuple[float, float]:
     """Return the best azimuth near one of the coarse search, and its error."""
     azimuths = azimuth_deg + np.arange(-STEP_DEG, STEP_DEG, FINE_DEG)
     errors = mirror_errors(points, azimuths)

@@ -3,11 +3,8 @@
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 SWEEPS = 6  # Jacobi sweeps, at most; a 4 x 4 matrix needs five for full precision
 STEEP = 1e30  # cotangent of twice an angle that changes no digit

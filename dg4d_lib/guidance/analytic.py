@@ -19,7 +19,7 @@ from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
 from dg4d_lib.guidance.distillation import TimestepSchedule
 from dg4d_lib.guidance.interface import GuidanceView
 
-LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3; a pixel picture is weighted as if it had as many
+LATENT_NUMBERS = 4 * 32 * 32  # latent size of Zero-1-to-3; pixel pictures are weighted as if they had this size
 
 CleanPictures = Callable[[Sequence[GuidanceView]], tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]]
 
@@ -30,8 +30,8 @@ class AnalyticPrior:
     Args:
         clean: color over white and alpha of every view, at its camera's size.
         schedule: of the timestep.
-        viewpoints: the only cameras `clean` knows; None is all.
-        frames: the only frames `clean` knows; None is all.
+        viewpoints: cameras that `clean` supports; None: all.
+        frames: frames that `clean` supports; None: all.
         weight: factor on the loss.
         weights: factor in place of `weight`, by frame.
     """

@@ -22,7 +22,7 @@ from dg4d_lib.shape_prior.raymarch import CELL
 from dg4d_lib.video.first_frame import Correspondence, match_first_frame, strain
 
 EDGE_ON = 0.1  # damps depths of motions in planes that are seen edge-on
-MOST_STRAIN = 0.15  # of the picture, at which the share of a guessed first frame falls to 1/e
+MOST_STRAIN = 0.15  # strain of the picture at which the share of a predicted first frame falls to 1/e
 
 
 class CarriedFields:

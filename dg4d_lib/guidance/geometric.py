@@ -1,7 +1,7 @@
 """Geometric prior without weights: renders of surfaces inflated from the driving video.
 
-The outline says nothing sure about depth. The best single picture of a view is then the average over what may be, so a
-view is blurred along the direction in which depth shows: not at all from the input camera, most from the side.
+The outline does not determine depth. The best single picture of a view is then the average over the possible depths,
+so a view is blurred along the direction in which depth shows: not at all from the input camera, most from the side.
 """
 
 import math
@@ -12,7 +12,6 @@ from typing import Protocol, no_type_check, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera, viewmats
@@ -21,6 +20,7 @@ from dg4d_lib.images import over_background
 from dg4d_lib.inflation.hints import NO_HINT, DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface, inflate, resample
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.settings import GeometricPriorSettings

@@ -65,8 +65,8 @@ class ImageDreamCondition:
 
     def rows(self, objects: Sequence[int]) -> "ImageDreamCondition":
         """Return the conditioning of some objects, in this order."""
-        chosen = to_device_async(torch.tensor(list(objects)), self.image_latents.device)
-        return ImageDreamCondition(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
+        selected = to_device_async(torch.tensor(list(objects)), self.image_latents.device)
+        return ImageDreamCondition(**{item.name: getattr(self, item.name)[selected] for item in fields(self)})
 
 
 class ImageDream:

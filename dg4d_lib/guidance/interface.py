@@ -27,7 +27,7 @@ class GuidanceView:
 
 
 def check_views(views: Sequence[GuidanceView], frames: int) -> None:
-    """Refuse views that shapes of some frames cannot answer together.
+    """Refuse views that cannot be rendered in one batch from the shapes of these frames.
 
     Raises:
         BadInput: no views, views of different sizes, or a frame that is not there.
@@ -42,7 +42,7 @@ def check_views(views: Sequence[GuidanceView], frames: int) -> None:
 
 
 def check_frame(frame: int, frames: int) -> None:
-    """Refuse a frame that is not there."""
+    """Refuse a frame that does not exist."""
     if not 0 <= frame < frames:
         raise BadInput(f"frame {frame} was requested; there are {frames}, counted from 0")
 
@@ -81,7 +81,7 @@ class GuidancePrior(Protocol):
 
 @runtime_checkable
 class SubjectShapes(Protocol):
-    """Shapes of a subject, one per frame, from which a prior draws the views that it expects."""
+    """Shapes of a subject, one per frame, from which a prior renders the expected views."""
 
     def surface(self, frame: int) -> InflatedSurface:
         """Return the closed, colored surface of a frame."""

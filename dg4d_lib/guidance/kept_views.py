@@ -1,4 +1,4 @@
-"""Views of known shapes from a few cameras, each drawn once."""
+"""Cache of rendered views of known shapes from a few cameras."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,10 @@ from dg4d_lib.guidance.interface import GuidanceView
 
 
 class KeptViews:
-    """Memory of drawn views in half precision: rounding changes a value in [0, 1] by at most 0.0003."""
+    """Cache of rendered views in half precision: rounding changes a value in [0, 1] by at most 0.0003."""
 
     def __init__(self, draw: CleanPictures) -> None:
-        """Store the function that draws color over white and alpha of views of one size."""
+        """Store the function that renders color over white and alpha of views of one size."""
         self._draw = draw
         self._kept: dict[GuidanceView, Tensor] = {}
 
@@ -22,7 +22,7 @@ class KeptViews:
         """Return color over white and alpha of views of one size, in [0, 1].
 
         Raises:
-            BadInput: a view cannot be drawn.
+            BadInput: a view cannot be rendered.
         """
         new = list(dict.fromkeys(view for view in views if view not in self._kept))
         if new:

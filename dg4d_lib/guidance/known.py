@@ -31,7 +31,7 @@ class KnownShapes:
         Args:
             guess: shapes of frames without known views.
             known: views by frame, the input view first.
-            predict: tells the shape behind each of their pictures; see `known_volume`.
+            predict: predicts the shape behind each of their pictures; see `known_volume`.
             surfaces: of some of these frames, where they are made already.
         """
         self._guess, self._predict = guess, predict
@@ -45,7 +45,7 @@ class KnownShapes:
 
     @property
     def has_predictions(self) -> bool:
-        """True if what is predicted behind the pictures counts at some frame."""
+        """True if predicted shapes behind the pictures are used at some frame."""
         return self._predict is not None and any(leaves_doubt(views) for views in self._known.values())
 
     @property

@@ -41,7 +41,7 @@ class LearnedShapes:
 
     @property
     def inflated_share(self) -> float:
-        """Mean share of the inflation in the frames that were asked for; 0 if none was."""
+        """Mean share of the inflation in the requested frames; 0 if none was requested."""
         return sum(self._inflated.values()) / max(1, len(self._inflated))
 
     def surface(self, frame: int) -> InflatedSurface:

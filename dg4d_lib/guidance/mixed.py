@@ -17,7 +17,7 @@ class MixedShapes:
         """Store the guesses.
 
         Args:
-            guesses: shapes of the same frames; the surfaces of the first stand for all.
+            guesses: shapes of the same frames; surfaces are taken from the first.
             shares: probability of each, sum 1.
         """
         self.guesses, self._shares = tuple(guesses), tuple(shares)

@@ -1,4 +1,4 @@
-"""Shapes of a subject from one surface that moves."""
+"""Shapes of a subject from a tracked surface."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from dg4d_lib.inflation.surface import InflatedSurface
 
 
 class MovedSurfaces:
-    """One surface per frame, as tracking gives them."""
+    """Tracked surfaces, one per frame."""
 
     def __init__(self, surfaces: Sequence[InflatedSurface]) -> None:
         """Store the surfaces, one per frame."""

@@ -60,10 +60,11 @@ class Bank:
 def perturb(bank: Bank, settings: OraclePriorSettings, generator: torch.Generator) -> Bank:
     """Perturb the view bank with blur, gain, shift and pose noise.
 
-    The perturbations are drawn once, so that the prior is the same in every iteration.
+    The perturbations are drawn once, so that the prior is the same in every iteration. They are drawn in the order of
+    the bank: perturb the whole bank before taking frames from it, so that a frame has the same errors in every fit.
 
     Args:
-        bank: ground-truth views.
+        bank: ground-truth views, of all frames.
         settings: standard deviations; zeros return the bank unchanged.
         generator: draws the perturbations.
     """

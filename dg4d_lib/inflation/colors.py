@@ -10,10 +10,10 @@ from dg4d_lib.inflation.heights import local_radius, outline_distance
 OPAQUE = 0.95  # alpha from which a pixel's color is the subject's own
 NEARLY_OPAQUE = 0.8
 THIN = 3.0  # pixels: parts farther than this from any sure pixel are too thin for the erosion
-THINNER = 6.0  # pixels: and those farther than this may even be translucent
-RIM_LENGTH = 0.008  # of the picture's height: how far colors spread at the rim
-CORE_LENGTH = 0.04  # and in the core of wide parts: large patches of the front stay, a face does not
-RIM_SHARE = 0.4  # of the local radius: where the core begins
+THINNER = 6.0  # pixels: parts farther than this may also be translucent
+RIM_LENGTH = 0.008  # diffusion length of colors at the rim, share of the picture's height
+CORE_LENGTH = 0.04  # the same in the core of wide parts: large patches of the front stay, a face does not
+RIM_SHARE = 0.4  # distance from the outline where the core begins, share of the local radius
 
 
 def front_colors(

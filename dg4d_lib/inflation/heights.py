@@ -21,7 +21,7 @@ ANCHOR = 1e-9  # keeps the membrane of a part without an outline finite
 def heights(mask: Bool[np.ndarray, "h w"], pixel: float) -> Float64[np.ndarray, "h w"]:
     """Return half the thickness at every pixel, 0 outside.
 
-    The border of the picture is not an outline: what it cuts stays thick there.
+    The border of the picture is not an outline: parts that it cuts keep their thickness there.
 
     Args:
         mask: the subject.

@@ -19,17 +19,17 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.inflation.heights import heights
 
-FARTHEST = 1.0  # world units: the middle leaves z = 0 by no more
+FARTHEST = 1.0  # world units: largest distance of the middle from z = 0
 FADE = 0.1  # world units beside known pixels: within it a hint loses most of its weight
 RIM = 3.0  # pixels: parts farther than this from the inside of the subject are all rim
 INVERSE_SIGMA, DISTANCE_SIGMA = 0.1, 0.03  # world units: error of the surface by relative and by metric depth
 LAYER = 0.15  # world units between mid-gray and white; on synthetic shapes 0.1 to 0.2 score the same
-LOW, HIGH = 0.02, 0.98  # quantiles that stand for least and greatest: depth pictures have outliers
-DEPTH_SHARE = 0.5  # of the smaller extent of the subject: range of the depths that a picture shows of it
-LEAST_COVERAGE = 0.1  # of a pixel by values, of which it holds the average
-LEAST_KNOWN = 0.25  # of the subject's pixels that a depth picture must show
-FLAT = 1e-4  # range of depths, relative to the median, that says nothing
-GRAY_STEP = 2 / 255  # difference of gray levels that counts
+LOW, HIGH = 0.02, 0.98  # quantiles in place of minimum and maximum: depth pictures have outliers
+DEPTH_SHARE = 0.5  # assumed range of the visible depths, share of the subject's smaller extent
+LEAST_COVERAGE = 0.1  # least covered share of a pixel with a depth
+LEAST_KNOWN = 0.25  # least share of the subject's pixels with a depth
+FLAT = 1e-4  # range of depths, relative to the median, below which a picture is flat
+GRAY_STEP = 2 / 255  # smallest difference between layers
 
 DepthKind = Literal["inverse", "distance"]
 
@@ -52,7 +52,7 @@ class DepthField:
 
 @dataclass(frozen=True)
 class DepthHint:
-    """All that is known about the depth of a subject.
+    """Depth hints of a subject.
 
     Attributes:
         turn_deg: how far its plane is turned about the vertical; positive brings the right side of the picture nearer

@@ -8,12 +8,12 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.inflation.surface import InflatedSurface
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 

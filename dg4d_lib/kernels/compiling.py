@@ -1,14 +1,16 @@
-"""Numba's on-disk cache, keyed by all source files of a kernel, and a log line before the first compilation.
+"""Numba's `njit`, with an on-disk cache keyed by all source files of a kernel and a log line before compilations.
 
 Numba caches machine code on disk and recompiles a kernel when its file changes. Our kernels also inline functions and
 constants from modules that they import, so their cache key includes a digest of these, and of those that they import
-in turn if they have kernels themselves.
+in turn if they have kernels themselves. Numba chooses the cache when a kernel is defined, and its own and ours use the
+same index files with different keys: if one kernel had either, by the order of imports, each would discard the machine
+code of the other. So every kernel of ours is defined by `njit` of this module; ruff refuses Numba's.
 """
 
 import hashlib
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from numba.core import event
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 from numba.core.registry import cpu_target
 
-NOTICE = "compiling CPU kernels (about ten seconds, only the first time)"
+NOTICE = "compiling the CPU kernels of this step, once per machine"
 
 _ROOT = Path(__file__).parents[2]  # that holds our packages
 _IMPORT = re.compile(r"^(?:from|import) ([\w.]+)(?: import (\([^)]*\)|.*))?", re.MULTILINE)
@@ -26,9 +28,15 @@ _KERNELS = ("njit", "KERNEL", "INLINE")  # in the source of a module with functi
 _log = logging.getLogger(__name__)
 
 
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """Return Numba's decorator for these options, with our cache and the compilation notice."""
+    configure_numba()
+    return numba.njit(**options)
+
+
 @cache
 def configure_numba() -> None:
-    """Install our cache locators and the compilation notice, once; call this before the first kernel is defined."""
+    """Install our cache locators and the compilation notice, once."""
     ours = [f"{__name__}.{locator.__name__}" for locator in (_EnvironmentCache, _SourceFolderCache, _UserCache)]
     locators = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's own, for kernels of others
     numba.config.CACHE_LOCATOR_CLASSES = locators  # type: ignore[attr-defined]  # missing in its stub

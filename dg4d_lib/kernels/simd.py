@@ -12,10 +12,6 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
-
 Value: TypeAlias = Any  # llvmlite value; its type stubs lack the attributes
 
 LANES = 16  # floats per vector

@@ -24,7 +24,7 @@ _kept_count = 0  # threads of the kernels while torch has one; 0: as torch
 
 
 def thread_count() -> int:
-    """Return the number of threads of the kernels: that of torch, or in `torch_on_one_thread` what it was before."""
+    """Return the number of threads of the kernels: that of torch, or in `torch_on_one_thread` its earlier value."""
     return _kept_count or torch.get_num_threads()
 
 

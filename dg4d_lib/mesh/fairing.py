@@ -111,7 +111,7 @@ def fair(
 def outline_shares(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], camera: OrbitCamera
 ) -> Float64[np.ndarray, " v"]:
-    """Return by how much every vertex lies on the outline of a surface, in [0, 1]."""
+    """Return a weight per vertex in [0, 1]: 1 on the outline of a surface, 0 away from it."""
     fragments = rasterize_mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces), [camera])
     shown = fragments.faces[0].numpy()
     border = (shown >= 0) & ~ndimage.binary_erosion(shown >= 0)
@@ -127,7 +127,7 @@ def thickness(
     Args:
         vertices: world units.
         faces: counter-clockwise seen from outside.
-        most: largest thickness that is told apart, world units.
+        most: thickness at which the result is clamped, world units.
     """
     normals = vertex_normals(torch.from_numpy(vertices).float(), torch.from_numpy(faces)).double().numpy()
     tree = cKDTree(np.concatenate([vertices, most * normals], 1))

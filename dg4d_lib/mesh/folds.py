@@ -8,14 +8,11 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
-from numba import njit
 
 from dg4d_lib.geometry.rotation import nearest_rotation
-from dg4d_lib.kernels.compiling import configure_numba
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.mesh.extraction.topology import face_components
 from dg4d_lib.mesh.neighbors import faces_to_vertices, half_edges, mesh_edges
-
-configure_numba()
 
 FOLD_DEG = 120.0  # between the normals of neighboring faces: the surface turns back on itself
 CREASE_DEG = 60.0  # between the normals of neighboring faces: a hard edge, seldom meant on creatures

@@ -44,9 +44,9 @@ def edge_graph(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     return coo_array((np.ones(2 * len(edges)), (rows, columns)), shape=(count, count)).tocsr()
 
 
-def connected_parts(edges: csr_array, chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Return the number of the connected part of every chosen vertex, where only edges between chosen ones count."""
-    labels: Int[np.ndarray, " n"] = connected_components(edges[chosen][:, chosen], directed=False)[1]
+def connected_parts(edges: csr_array, selected: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Label every selected vertex by its connected component, using only edges between selected vertices."""
+    labels: Int[np.ndarray, " n"] = connected_components(edges[selected][:, selected], directed=False)[1]
     return labels
 
 

@@ -17,7 +17,7 @@ from dg4d_lib.mesh_rasterizer.texture import build_lookup, sample_texture
 from dg4d_lib.mesh_rasterizer.texture_cpu import MipLevels, Rasterized, mip_levels, texture_colors
 from dg4d_lib.mesh_rasterizer.zbuffer import interpolate, rasterize_mesh
 
-SUPERSAMPLING = 3  # samples per pixel along each axis, unless told; odd, so that no pixel is covered by exactly half
+SUPERSAMPLING = 3  # default samples per pixel along each axis; odd, so that no pixel is covered by exactly half
 LIGHT = (-0.4, -0.6, -0.7)  # direction towards the light, in the camera's axes (x right, y down, z forward)
 AMBIENT, DIFFUSE = 0.5, 0.7  # a face turned 45 degrees from the light keeps its color
 
@@ -93,22 +93,6 @@ def render_mesh(
     """
     vertices = mesh.vertices if offsets is None else mesh.vertices + offsets
     return _render(mesh, vertices, cameras, None, supersampling)
-
-
-def render_lit(
-    mesh: TexturedMesh, camera: OrbitCamera, supersampling: int = SUPERSAMPLING
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
-    """Render a mesh once as `LitRenderer` does.
-
-    Args:
-        mesh: the mesh.
-        camera: the camera.
-        supersampling: samples per pixel along each axis.
-
-    Returns:
-        Straight color and alpha, in [0, 1].
-    """
-    return LitRenderer(supersampling).render(mesh, camera)
 
 
 def _render(

@@ -4,15 +4,12 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float64
-from numba import njit
 from scipy.sparse import csr_array
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 TOLERANCE = 1e-4  # of the right-hand side, in the norm of the preconditioner; leaves less than 0.01 pixels
-ITERATIONS = 500  # at most; with pulls from 0.05 on, tens are enough
+ITERATIONS = 500  # largest number; with pulls of 0.05 and more, tens are enough
 
 
 def solve_screened(

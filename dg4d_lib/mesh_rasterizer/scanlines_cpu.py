@@ -10,10 +10,10 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, Int32
-from numba import njit
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import Scratch, run_parallel
 from dg4d_lib.mesh_rasterizer.scanlines import DEPTH_STEPS, EMPTY, FAR_OFF, NEAR
 

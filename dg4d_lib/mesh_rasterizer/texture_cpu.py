@@ -10,11 +10,11 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int
-from numba import njit
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh_rasterizer.zbuffer import Fragments
 
@@ -88,7 +88,7 @@ def texture_colors(
 
 
 def _of_views(work: Callable[..., None], rasterized: Rasterized, size: Sequence[int]) -> None:
-    """Call a function for every image with its number and what the kernels know of it."""
+    """Call a function for every image with its number and the arguments of the kernels."""
     vertices, faces, uvs, cameras, fragments = rasterized
     states, coordinates = vertices.detach().double().numpy(), uvs.detach().double().numpy()
     triangles = np.ascontiguousarray(faces.int().numpy())

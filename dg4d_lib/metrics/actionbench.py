@@ -55,39 +55,43 @@ class Alignment:
         return (self.scale * points) @ self.rotation + self.translation
 
 
-def unit_box(truth: Float[Tensor, "t n 3"]) -> tuple[Float[Tensor, " 3"], float]:
+def unit_box(ground_truth: Float[Tensor, "t n 3"]) -> tuple[Float[Tensor, " 3"], float]:
     """Return center and factor that fit a whole animation into [-1, 1] along its longest axis."""
-    low, high = truth.flatten(0, 1).amin(0), truth.flatten(0, 1).amax(0)
+    low, high = ground_truth.flatten(0, 1).amin(0), ground_truth.flatten(0, 1).amax(0)
     return (low + high) / 2, 2 * WIDEST / max(float((high - low).max()), 1e-12)
 
 
-def chamfer_3d(points: Float[Tensor, "t n 3"], truth: Float[Tensor, "t m 3"], alignments: Sequence[Alignment]) -> float:
+def chamfer_3d(
+    points: Float[Tensor, "t n 3"], ground_truth: Float[Tensor, "t m 3"], alignments: Sequence[Alignment]
+) -> float:
     """Return the mean over frames of the chamfer distance, each frame by its own alignment."""
-    frames = zip(points, truth, alignments, strict=True)
+    frames = zip(points, ground_truth, alignments, strict=True)
     return fmean(chamfer_sum(align(ours), theirs) for ours, theirs, align in frames)
 
 
-def chamfer_4d(points: Float[Tensor, "t n 3"], truth: Float[Tensor, "t m 3"], alignment: Alignment) -> float:
+def chamfer_4d(points: Float[Tensor, "t n 3"], ground_truth: Float[Tensor, "t m 3"], alignment: Alignment) -> float:
     """Return the mean over frames of the chamfer distance, all frames by the alignment of the first."""
-    return chamfer_3d(points, truth, [alignment] * len(points))
+    return chamfer_3d(points, ground_truth, [alignment] * len(points))
 
 
-def chamfer_motion(tracked: Float[Tensor, "t n 3"], truth: Float[Tensor, "u m 3"], alignment: Alignment) -> float:
+def chamfer_motion(
+    tracked: Float[Tensor, "t n 3"], ground_truth: Float[Tensor, "u m 3"], alignment: Alignment
+) -> float:
     """Return the mean distance over time of points that are nearest neighbors in the first frame.
 
     Args:
         tracked: points that stay on one place of the surface.
-        truth: likewise.
+        ground_truth: likewise.
         alignment: of the first frame.
 
     Raises:
         BadInput: different numbers of frames.
     """
-    if len(tracked) != len(truth):
-        raise BadInput(f"motion is compared frame by frame; given {len(tracked)} and {len(truth)} frames")
+    if len(tracked) != len(ground_truth):
+        raise BadInput(f"motion is compared frame by frame; given {len(tracked)} and {len(ground_truth)} frames")
     ours = align_all(tracked, alignment)
     total = 0.0
-    for here, there in ((ours, truth), (truth, ours)):
+    for here, there in ((ours, ground_truth), (ground_truth, ours)):
         nearest = nearest_indices(there[0], here[0])
         total += float((there[:, nearest] - here).norm(dim=-1).mean())
     return total
@@ -111,17 +115,17 @@ def align_all(points: Float[Tensor, "t n 3"], alignment: Alignment) -> Float[Ten
     return torch.stack([alignment(frame) for frame in points])
 
 
-def align_points(points: Float[Tensor, "n 3"], truth: Float[Tensor, "m 3"]) -> Alignment:
+def align_points(points: Float[Tensor, "n 3"], ground_truth: Float[Tensor, "m 3"]) -> Alignment:
     """Return the alignment of one cloud with another, by gradient descent from the rotations of a cube.
 
     Args:
         points: to be aligned, in random order.
-        truth: target, in random order.
+        ground_truth: target, in random order.
     """
     starts = cube_rotations().to(points)
-    losses, _ = _descend(points[:SCREEN_POINTS], truth[:SCREEN_POINTS], starts, SCREEN_ITERATIONS)
+    losses, _ = _descend(points[:SCREEN_POINTS], ground_truth[:SCREEN_POINTS], starts, SCREEN_ITERATIONS)
     finalists = losses.argsort(stable=True)[:FINALISTS]
-    losses, alignments = _descend(points, truth, starts[finalists], ITERATIONS)
+    losses, alignments = _descend(points, ground_truth, starts[finalists], ITERATIONS)
     return alignments[int(losses.argmin())]
 
 
@@ -142,7 +146,7 @@ def nearest_indices(points: Float[Tensor, "n 3"], queries: Float[Tensor, "m 3"])
 
 @torch.enable_grad()
 def _descend(
-    points: Float[Tensor, "n 3"], truth: Float[Tensor, "m 3"], starts: Float[Tensor, "k 3 3"], iterations: int
+    points: Float[Tensor, "n 3"], ground_truth: Float[Tensor, "m 3"], starts: Float[Tensor, "k 3 3"], iterations: int
 ) -> tuple[Float[Tensor, " k"], list[Alignment]]:
     """Return the smallest loss of every start, and its alignment."""
     count = len(starts)
@@ -155,7 +159,7 @@ def _descend(
     for _ in range(iterations):
         rotations = starts @ _rotation(rows)
         moved = (scale[:, None] * points) @ rotations + translation[:, None]
-        losses = _squared_chamfer(moved, truth)
+        losses = _squared_chamfer(moved, ground_truth)
         better = losses.detach() < best
         best = torch.where(better, losses.detach(), best)
         for store, value in zip(kept, (scale, rotations, translation), strict=True):
@@ -166,21 +170,21 @@ def _descend(
     return best, [Alignment(*parts) for parts in zip(*kept, strict=True)]
 
 
-def _squared_chamfer(moved: Float[Tensor, "k n 3"], truth: Float[Tensor, "m 3"]) -> Float[Tensor, " k"]:
+def _squared_chamfer(moved: Float[Tensor, "k n 3"], ground_truth: Float[Tensor, "m 3"]) -> Float[Tensor, " k"]:
     """Return the sum of the mean squared distances to nearest neighbors in both directions, for every start."""
-    there, back = _neighbors(moved.detach(), truth)
-    forth = (moved - truth[there]).square().sum(-1).mean(-1)
-    return forth + (moved.gather(1, back[..., None].expand(-1, -1, 3)) - truth).square().sum(-1).mean(-1)
+    there, back = _neighbors(moved.detach(), ground_truth)
+    forth = (moved - ground_truth[there]).square().sum(-1).mean(-1)
+    return forth + (moved.gather(1, back[..., None].expand(-1, -1, 3)) - ground_truth).square().sum(-1).mean(-1)
 
 
 def _neighbors(
-    moved: Float[Tensor, "k n 3"], truth: Float[Tensor, "m 3"]
+    moved: Float[Tensor, "k n 3"], ground_truth: Float[Tensor, "m 3"]
 ) -> tuple[Int[Tensor, "k n"], Int[Tensor, "k m"]]:
     """Return the indices of nearest neighbors in both directions; few points are compared one by one."""
-    if moved.shape[1] * len(truth) <= FEW:
-        distances = torch.cdist(moved, truth.expand(len(moved), -1, -1))
+    if moved.shape[1] * len(ground_truth) <= FEW:
+        distances = torch.cdist(moved, ground_truth.expand(len(moved), -1, -1))
         return distances.argmin(2), distances.argmin(1)
-    pairs = [(nearest_indices(truth, each), nearest_indices(each, truth)) for each in moved]
+    pairs = [(nearest_indices(ground_truth, each), nearest_indices(each, ground_truth)) for each in moved]
     there, back = zip(*pairs, strict=True)
     return torch.stack(there), torch.stack(back)
 

@@ -7,11 +7,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from dg4d_lib.asset_settings import CutoutGateSettings
-from dg4d_lib.metrics.gates import Gate
+from dg4d_lib.metrics.gates import CONNECTIVITY, SUBJECT_ALPHA, Gate
 
 FORM = "cut-out"
-SUBJECT_ALPHA = 0.5  # pixels with a larger alpha belong to the subject
-CONNECTIVITY = np.ones((3, 3))  # 8-connected pieces
 SMALLEST_HOLE = 4e-4  # share of the filled subject; smaller holes are highlights and noise
 BORDER = 0.01  # width of the border, as a share of the longest side
 ADVICE = "give a mask (--mask FILE) or a box (--box X,Y,W,H), or choose another subject.matting"

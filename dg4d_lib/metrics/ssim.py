@@ -6,11 +6,11 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.metrics.image import as_float
 

@@ -89,10 +89,10 @@ def place_points(
     if len(faces) == 0 or not 0 < float(ends[-1]) < torch.inf:
         raise BadInput(f"a surface of {len(faces)} triangles has no area and cannot be sampled")
     position, u, v = torch.rand(3, samples, generator=generator, dtype=torch.float64)
-    chosen = torch.searchsorted(ends, position * ends[-1], right=True).clamp(max=len(faces) - 1)
+    selected = torch.searchsorted(ends, position * ends[-1], right=True).clamp(max=len(faces) - 1)
     outside = u + v > 1  # the other half of the parallelogram, mirrored back
     u, v = torch.where(outside, 1 - u, u), torch.where(outside, 1 - v, v)
-    return SurfacePoints(faces.cpu().long()[chosen], u, v)
+    return SurfacePoints(faces.cpu().long()[selected], u, v)
 
 
 def _box(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, ""]]:

@@ -3,9 +3,9 @@
 from typing import Any, no_type_check
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import Scratch
 from dg4d_lib.rasterizer.cpu_project import EXTENT_X, EXTENT_Y, MEAN2D_X, MEAN2D_Y

@@ -10,9 +10,9 @@ from math import log
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from dg4d_lib.geometry.spherical_harmonics import C0
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.rasterizer.interface import BLUR, MIN_ALPHA, NEAR
 

@@ -7,8 +7,8 @@ nested loops over rows would lose time to mispredicted branches.
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import INLINE, KERNEL, LANES
 from dg4d_lib.rasterizer.cpu_bins import TILE
 from dg4d_lib.rasterizer.cpu_blend import (

@@ -67,28 +67,6 @@ class Features:
     code: Float[Tensor, "b c"]
 
 
-@dataclass(frozen=True)
-class ShapePrediction:
-    """Network output for a batch of pictures.
-
-    Attributes:
-        occupancy: logits at the middle of every cell of the frustum; the nearest first.
-        colors: of surfaces that the picture does not show, at `KNOTS` depths from `NEAR` to `FAR`, in [0, 1].
-        color_scale: expected absolute error of `colors`.
-        mirror_moment: expected outer product of the mirror plane's unit normal with itself (world axes): its largest
-            eigenvector is the normal, and the eigenvalue, from 1/3 to 1, says how sure that is.
-        mirror_point: point of the mirror plane nearest to the origin, world units.
-        symmetric: logit of the subject having a mirror plane.
-    """
-
-    occupancy: Float[Tensor, "b 64 128 128"]
-    colors: Float[Tensor, "b 8 3 128 128"]
-    color_scale: Float[Tensor, "b 1 128 128"]
-    mirror_moment: Float[Tensor, "b 3 3"]
-    mirror_point: Float[Tensor, "b 3"]
-    symmetric: Float[Tensor, " b"]
-
-
 class ShapePriorNetwork(nn.Module):
     """Picture to matter on the rays of the input camera."""
 
@@ -149,12 +127,16 @@ class ShapePriorNetwork(nn.Module):
     def rays(
         self, decoded: Float[Tensor, "b f 64 64"], planes: Float[Tensor, "b p 128 128"], pixels: Int[Tensor, " n"]
     ) -> tuple[Float[Tensor, "n 64"], Float[Tensor, "n 8 3"], Float[Tensor, "n 1"]]:
-        """Return occupancy logits, colors in [0, 1] and the colors' scale of some rays.
+        """Predict matter and colors on some rays.
 
         Args:
             decoded: of `decode`; linear between its pixels.
             planes: `Features.picture`.
             pixels: flat indices into batch, row and column.
+
+        Returns:
+            Occupancy logits at the middle of every cell of the frustum, the nearest first; colors in [0, 1] of surfaces
+            that the picture does not show, at `KNOTS` depths from `NEAR` to `FAR`; and their expected absolute error.
         """
         batch, row, column = pixels // SIZE**2, pixels // SIZE % SIZE, pixels % SIZE
         cells = decoded.permute(0, 2, 3, 1).flatten(0, 2)
@@ -173,32 +155,22 @@ class ShapePriorNetwork(nn.Module):
     def mirror(
         self, code: Float[Tensor, "b c"]
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Float[Tensor, " b"]]:
-        """Return moment, nearest point and logit of the mirror plane; see `ShapePrediction`."""
+        """Predict the mirror plane of a subject.
+
+        Args:
+            code: of `encode`, or another; see `decode`.
+
+        Returns:
+            Expected outer product of the plane's unit normal with itself (world axes): its largest eigenvector is the
+            normal, and the eigenvalue, from 1/3 to 1, says how sure that is; the point of the plane nearest to the
+            origin, world units; and the logit of the subject having a mirror plane.
+        """
         numbers = self.plane(code)
         rows, columns = torch.triu_indices(3, 3)
         moment = numbers.new_zeros(len(numbers), 3, 3)
         moment[:, rows, columns] = numbers[:, :6]
         moment = moment + moment.triu(1).transpose(1, 2) + torch.eye(3, device=moment.device) / 3
         return moment, numbers[:, 6:9], numbers[:, 9]
-
-    def forward(
-        self, picture: Float[Tensor, "b 4 128 128"], code: Float[Tensor, "b c"] | None = None
-    ) -> ShapePrediction:
-        """Predict matter, hidden colors and mirror plane.
-
-        Args:
-            picture: premultiplied color and alpha in [0, 1], as `prepare_subject` frames them.
-            code: instead of the pictures' own codes; see `decode`.
-        """
-        features = self.encode(picture)
-        pixels = torch.arange(len(picture) * SIZE**2, device=picture.device)
-        found = self.rays(self.decode(features, code), features.picture, pixels)
-        occupancy, colors, scale = (part.unflatten(0, (-1, SIZE, SIZE)) for part in found)
-        moment, point, symmetric = self.mirror(features.code if code is None else code)
-        return ShapePrediction(
-            occupancy.permute(0, 3, 1, 2), colors.permute(0, 3, 4, 1, 2), scale.permute(0, 3, 1, 2),
-            moment, point, symmetric,
-        )  # fmt: skip
 
 
 def coordinates(alpha: Float[Tensor, "b h w"]) -> Float[Tensor, "b 4 h w"]:

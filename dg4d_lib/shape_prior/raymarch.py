@@ -9,12 +9,12 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
-from numba import njit
 from scipy import ndimage
 from torch import Tensor
 
 from dg4d_lib.cameras.orbit import RADIUS, OrbitCamera
 from dg4d_lib.errors import BadInput
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.simd import INLINE, KERNEL
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.shape_prior.frustum import BINS, FAR, NEAR, SIZE, TAN_HALF_FOV

@@ -18,7 +18,7 @@ from dg4d_lib.images import luminance
 from dg4d_lib.video.optical_flow import optical_flow
 
 BACKDROP = 1.5  # luminance outside of the subject: brighter than any, so that outlines guide the flow
-DIFFERENCE = 0.2  # of color (mean) and alpha together, at which the trust falls to 1/e
+DIFFERENCE = 0.2  # summed difference of color (mean) and alpha at which the trust falls to 1/e
 WINDOW = 5  # pixels of a side over which differences are averaged
 SMOOTH = 3.0  # pixels: standard deviation of the window in which the strain of the flow is taken
 THINNEST = 0.1  # square pixels, added to the variances in that window: thin parts have no strain across

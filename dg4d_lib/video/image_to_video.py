@@ -134,7 +134,7 @@ class ImageToVideo:
         return math.ceil((wanted - 1) / factor) * factor + 1 if factor > 1 else wanted
 
     def _size(self) -> tuple[int, int]:
-        """Return height and width, multiples of what one patch of the network covers."""
+        """Return height and width, multiples of the pixels of one patch of the network."""
         unit = _first(self.pipeline, SPATIAL_FACTORS, 8) * _patch(self.pipeline)
         asked = self.settings.height, self.settings.width
         height, width = (max(unit, round(side / unit) * unit) for side in asked)

@@ -19,9 +19,9 @@ from dg4d_lib.kernels.compiling import configure_numba
 configure_numba()
 
 KERNEL = {"fastmath": {"contract"}, "nogil": True, "cache": True, "error_model": "numpy"}
-LEVELS, SMALLEST = 10, 16  # of the pyramid: their largest number, and pixels of the smallest side
+LEVELS, SMALLEST = 10, 16  # of the pyramid: largest number of levels, and least side in pixels
 WARPS = 5  # linearizations at every level, at most
-STEPS, DUAL_STEPS = 10, 2  # of a linearization, and of the dual variable in each of them
+STEPS, DUAL_STEPS = 10, 2  # iterations per linearization, and dual steps per iteration
 ATTACHMENT, TIGHTNESS, TIME_STEP = 15.0, 0.3, 0.25
 TOLERANCE = 1e-4  # square pixels, mean over the picture; steps after the first one that change less are the last ones
 LIMIT = np.float32(ATTACHMENT * TIGHTNESS)  # of the step along the gradient

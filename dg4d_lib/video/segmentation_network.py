@@ -44,7 +44,7 @@ class Preprocessing:
 
 @runtime_checkable
 class Segmentation(Protocol):
-    """Anything that tells where the salient object of a picture is."""
+    """Segmentation of the salient object of a picture."""
 
     def probability(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
         """Return the probability of every pixel of an sRGB picture in [0, 1]."""

@@ -99,7 +99,7 @@ class _Shown:
     top: int = 0
 
 
-def _whole(frames: Float[Tensor, "t h w 4"]) -> _Shown:
+def _full_frame(frames: Float[Tensor, "t h w 4"]) -> _Shown:
     return _Shown(frames, (frames.shape[1], frames.shape[2]))
 
 
@@ -131,14 +131,14 @@ def prepare_subject(
     estimate = None
     given = has_alpha or mask is not None
     if mask is not None:
-        shown = _whole(apply_mask(frames, mask))
+        shown = _full_frame(apply_mask(frames, mask))
     elif settings.matting != "none" and not (settings.matting == "auto" and has_alpha):
         estimate, shown, notes = _estimated(frames, settings, segmenter)
         given = False
     else:
-        shown = _whole(frames)
+        shown = _full_frame(frames)
     if settings.box and estimate is None:
-        shown = _whole(_inside(shown.frames, settings.box))
+        shown = _full_frame(_inside(shown.frames, settings.box))
     alpha = shown.frames[..., 3]
     bounding_box(alpha)  # raises if no frame shows anything
     check_shown(alpha)
@@ -205,7 +205,7 @@ def _estimated(
 ) -> tuple[Matte, _Shown, tuple[str, ...]]:
     """Return the estimate in the frame of the source, cut-outs to crop from, and notes."""
     estimate = _estimate(frames, settings, segmenter)
-    shown = _whole(estimate.frames)
+    shown = _full_frame(estimate.frames)
     notes: tuple[str, ...] = ()
     if box := _small_subject(frames, estimate, settings):
         if closer := _look_closer(frames, box, estimate, settings, segmenter):
@@ -233,8 +233,8 @@ def _matte(frames: Float[Tensor, "t h w 4"], settings: SubjectSettings, segmente
     """Cut the subject out of frames, over white where they are transparent, at a reduced size."""
     method: Literal["auto", "backdrop", "network"] = "network"
     match settings.matting:
-        case "auto" | "backdrop" as chosen:
-            method = chosen
+        case "auto" | "backdrop" as selected:
+            method = selected
     opaque = torch.cat([over_white(frames), torch.ones_like(frames[..., 3:])], -1)
     small = downscale(opaque, OVERSAMPLING * settings.size)
     return matte(small[..., :3], method, segmenter.load)

@@ -49,7 +49,7 @@ class Warp:
     """
 
     def __init__(self, settings: WarpSettings, hint: DepthHint = NO_HINT) -> None:
-        """Store the settings, and what is known about the depth of the subject, for `turn`."""
+        """Store the settings, and the depth hints of the subject, for `turn`."""
         self.settings, self.hint = settings, hint
         self.notes: tuple[str, ...] = ()
 

@@ -232,7 +232,7 @@ def _files(folder: Path, parts: tuple[str, ...]) -> Iterator[Path]:
 def _components(model_index: dict[str, Any]) -> list[str]:
     """Return the folders of a pipeline of diffusers; an absent component is a list of nulls.
 
-    A name with a path would lead out of the folder: it is not a component, and a pull would remove what is there.
+    A name with a path would lead out of the folder: it is not a component, and a pull would remove files there.
     """
     return [
         name

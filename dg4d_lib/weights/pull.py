@@ -42,7 +42,7 @@ class PullPlan:
         folder: destination.
         revision: commit on the hub.
         license: id on the model card; empty if the card has none.
-        sizes: bytes of every needed file, by its path in the folder; 0 if the hub does not tell.
+        sizes: bytes of every needed file, by its path in the folder; 0 if the hub does not list it.
         published: sha256 of files whose digest is known before the download.
     """
 
@@ -108,8 +108,8 @@ def plan_pull(weights: Weights, home: Path) -> PullPlan:
     published = {file.rfilename: file.lfs.sha256 for file in listed if file.lfs is not None}
     if weights.revision in (None, info.sha):
         published |= weights.published
-    chosen = set(needed([file.rfilename for file in listed], weights.parts))
-    sizes = {file.rfilename: int(file.size or 0) for file in listed if file.rfilename in chosen}
+    selected = set(needed([file.rfilename for file in listed], weights.parts))
+    sizes = {file.rfilename: int(file.size or 0) for file in listed if file.rfilename in selected}
     card = str(getattr(info.card_data, "license", None) or "")
     return PullPlan(weights, folder, info.sha or "", card, dict(sorted(sizes.items())), published)
 

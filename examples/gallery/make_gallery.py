@@ -21,7 +21,7 @@ from torch import Tensor
 import dg4d
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.images import over_white
-from dg4d_lib.mesh.render import render_lit
+from dg4d_lib.mesh.render import LitRenderer
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from examples.gallery.pictures import write_picture
 from flows.inputs.manifest import parse_changes
@@ -135,13 +135,14 @@ def write_film(package: Path, path: Path) -> None:
     manifest = read_manifest(package)
     states, surface = read_states(package, manifest), read_surface(package, manifest)
     rasterize = get_rasterizer("auto")
+    renderer = LitRenderer()
     count = round(LOOPS * manifest.frames / manifest.fps * FPS)
     pictures = []
     for k in range(count):
         position = torch.tensor([k * LOOPS * manifest.frames / count % manifest.frames], dtype=torch.float64)
         camera = OrbitCamera(8.0, SWAY_DEG * math.sin(2 * math.pi * k / count), DISTANCE, width=PANEL, height=PANEL)
         splats = rasterize(states(position), [camera], torch.ones(3)).color[0]
-        mesh = over_white(torch.cat(render_lit(mesh_at(surface, position[0]), camera), -1))
+        mesh = over_white(torch.cat(renderer.render(mesh_at(surface, position[0]), camera), -1))
         pictures.append(Image.fromarray(np.concatenate([_bytes(mesh), _bytes(splats)], axis=1)))
     for quality in QUALITIES:
         pictures[0].save(

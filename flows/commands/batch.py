@@ -67,7 +67,7 @@ def print_summary(rows: list[Row], out: Path, console: "Console") -> int:
             console.print(f"not accepted: {row.item}: {', '.join(row.failing)}", markup=False, style="yellow")
     if all(row.status == "unchanged" for row in rows):
         console.print("nothing to do: every item is up to date")
-    console.print(f"{sum(row.made for row in rows)} of {len(rows)} items are in {out}", markup=False)
+    console.print(f"{sum(row.has_package for row in rows)} of {len(rows)} items are in {out}", markup=False)
     console.print(f"overview: {out / 'index.html'}", markup=False)
     if not failed:
         return 0

@@ -136,7 +136,7 @@ def rebuild(
 
 
 def _print_scores(results: "Results", console: "Console") -> None:
-    """Print scores as tables, and below them what is missing."""
+    """Print scores as tables, and below them the missing metrics."""
     from flows.commands import terminal
     from flows.packages.scores import remarks, titled_tables
 

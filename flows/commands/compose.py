@@ -89,7 +89,7 @@ def read_scene(path: Path) -> Scene:
 
 
 def _problems(error: ValidationError) -> str:
-    """Return what is wrong in a scene file, field by field."""
+    """Return the errors of a scene file, field by field."""
     lines = []
     for each in error.errors(include_url=False):
         *above, last = each["loc"] or ("",)

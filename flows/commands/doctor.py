@@ -56,13 +56,13 @@ def _print(out: "Console", profile: str, machine: "Machine", found: dict[str, "R
 
     for table in (_machine_table(machine), _profile_table(found)):
         out.print(table, width=min(COLUMNS, out.width), soft_wrap=False)
-    chosen = found[profile]
-    out.print(f"{profile}: {chosen.state}", markup=False)
-    for lack in chosen.lacks:
+    readiness = found[profile]
+    out.print(f"{profile}: {readiness.state}", markup=False)
+    for lack in readiness.lacks:
         out.print(f"  lacks {visible(lack)}", markup=False)
-    if chosen.command:
-        out.print(f"  {chosen.command}", markup=False, soft_wrap=True)
-    if chosen.weights and machine.gpu_problem:
+    if readiness.command:
+        out.print(f"  {readiness.command}", markup=False, soft_wrap=True)
+    if readiness.weights and machine.gpu_problem:
         out.print("  Without a GPU its networks run on the CPU, which takes days.", markup=False)
 
 

@@ -29,7 +29,11 @@ from flows.processes import start_reminder
 __all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
-NO_FOLDER = {errno.EEXIST, errno.ENOENT, errno.ENOTDIR}  # of mkdir, where a file is or where no folder can be
+NO_FOLDER = {
+    errno.EEXIST,
+    errno.ENOENT,
+    errno.ENOTDIR,
+}  # errors of mkdir if a file is in the way or the folder cannot exist
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; run the same command again to continue after the last finished step"
 
@@ -142,7 +146,7 @@ def _unusable_folder(error: OSError) -> str:
 
 
 def _refused_path(error: OSError) -> str:
-    """Return a sentence if the path or the disk is the user's to change, else nothing."""
+    """Return a sentence if the error is due to a path or a disk that the user can change, else nothing."""
     from steps.store.files import NO_SPACE
 
     if error.errno not in {*NO_SPACE, errno.EROFS, *UNREACHABLE}:
@@ -183,7 +187,7 @@ def _save_traceback(error: Exception) -> str:
 
 
 def _output_closed() -> bool:
-    """Return whether nobody reads standard output any more; if so, discard what waits to be written."""
+    """Return whether the reader of standard output is gone; if so, discard buffered output."""
     try:
         number = sys.stdout.fileno()
     except (AttributeError, OSError, ValueError):  # no standard output, or one of a test

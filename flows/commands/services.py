@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from flows.serving.server import Server
 
 POLL_S = 1.0  # between two scans of a watched folder
-RESULTS_EVERY_S = 5.0  # between two looks for finished packages
+RESULTS_EVERY_S = 5.0  # between two polls for finished packages
 OPEN_OWN = "open this address first: it signs the browser in to the Prefect UI"
 WATCH_STOPPED = "stopped watching; conversions that were sent continue until `dg4d down`"
 OPEN_OTHER = "open this address, the Prefect UI of $PREFECT_API_URL; a server of dg4d signs the browser in at"
@@ -126,15 +126,15 @@ def _serve(
     from flows.serving.workers import Worker, limit
 
     known = read_pools()
-    chosen = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
-    if unknown := [name for name in chosen if name not in known]:
+    pool_names = pools or ["process-cpu", *(["process-gpu"] if cuda_device_count() else [])]
+    if unknown := [name for name in pool_names if name not in known]:
         raise BadInput(f"unknown pool {unknown[0]!r}; deploy/pools.yaml has: {', '.join(known)}")
     server = background.background_server()
     variables = roots.environment(sources or ())
-    limits = {name: limit(known[name].per_worker) for name in chosen}
-    own = [Worker(name, server.folder) for name in chosen] if workers else []
+    limits = {name: limit(known[name].per_worker) for name in pool_names}
+    own = [Worker(name, server.folder) for name in pool_names] if workers else []
     for worker in own:
-        if sources and not quiet and worker.is_there() and worker.sources != variables[roots.SOURCES]:
+        if sources and not quiet and worker.is_running() and worker.sources != variables[roots.SOURCES]:
             raise BadInput(f"the worker of {worker.pool} runs with --sources {worker.sources}; stop it: `dg4d down`")
     if "PREFECT_API_URL" not in os.environ:
         server.start()
@@ -143,7 +143,9 @@ def _serve(
     from flows.engine.item_runs import FLOW
     from flows.serving.registering import register
 
-    forms = [name for name in register(known, chosen) if not name.startswith(f"{FLOW}/")]  # catalogs start the others
+    forms = [
+        name for name in register(known, pool_names) if not name.startswith(f"{FLOW}/")
+    ]  # catalogs start the others
     if forms and not quiet:
         typer.echo("deployments with forms in the Prefect UI:", err=True)
         for name in forms:
@@ -235,13 +237,13 @@ def watch(
         with granted(watcher.folder, watcher.out):
             while True:
                 if time.monotonic() - looked >= RESULTS_EVERY_S:
-                    lines = results.look()
-                    with suppress(httpx.HTTPError):  # the next look asks again
-                        lines += runs.look()
+                    lines = results.poll()
+                    with suppress(httpx.HTTPError):  # retried by the next poll
+                        lines += runs.poll()
                     for line in lines:
                         typer.echo(line)
                     looked = time.monotonic()
-                if (digest := watcher.look(time.monotonic())) is not None:
+                if (digest := watcher.poll(time.monotonic())) is not None:
                     before, trouble = trouble, ""
                     try:
                         announce(watcher.folder, watcher.inputs(), watcher.out, digest)
@@ -253,7 +255,7 @@ def watch(
                         trouble = "the server is unavailable; the files are sent when it answers"
                         revive()
                     else:
-                        watcher.told()
+                        watcher.mark_announced()
                         typer.echo(
                             f"no change for {rest_s:g} s: files sent to the server; finished packages are listed below"
                         )

@@ -29,10 +29,10 @@ def settings(
         from flows.inputs.setting_reference import all_settings, find_settings, value_in
         from steps.profiles import profile as find_profile
 
-        chosen = find_profile(profile)
+        pipeline = find_profile(profile)
         for one in find_settings(name) if name else all_settings():
             kind = f"  (with {one.only_with})" if one.only_with else ""
-            typer.echo(f"{one.name} = {value_in(chosen, one) or one.default}{kind}")
+            typer.echo(f"{one.name} = {value_in(pipeline, one) or one.default}{kind}")
             if name:
                 typer.echo(_details(one))
 

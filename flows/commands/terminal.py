@@ -134,15 +134,15 @@ class StepBars:
         )
         self._bars: dict[str, TaskID] = {}
         self._values = None if out.width >= WIDE else 1  # a narrow terminal has room for the loss only
-        self._whole = self.progress.add_task("starting", total=len(schedule.steps), numbers="") if schedule else None
+        self._overall = self.progress.add_task("starting", total=len(schedule.steps), numbers="") if schedule else None
 
     def __call__(self, event: StepEvent) -> None:
         """Show an event."""
-        if self._whole is not None and self._schedule is not None:
+        if self._overall is not None and self._schedule is not None:
             if event.kind == "started" and (place := self._schedule.position(event.step)):
-                self.progress.update(self._whole, description=place)
+                self.progress.update(self._overall, description=place)
             left = format_left(self._schedule.seconds_left())
-            self.progress.update(self._whole, completed=self._schedule.finished, numbers=left)
+            self.progress.update(self._overall, completed=self._schedule.finished, numbers=left)
         if event.step not in self._bars:
             self._bars[event.step] = self.progress.add_task(plain(event.step), total=None, numbers="")
         bar = self._bars[event.step]

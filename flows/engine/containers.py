@@ -98,7 +98,7 @@ def engine() -> str:
 @functools.cache
 def _answering_engine() -> str:
     for name in ENGINES:
-        if shutil.which(name) is not None and _ask([name, "ps", "--quiet"]) is not None:
+        if shutil.which(name) is not None and _query([name, "ps", "--quiet"]) is not None:
             return name
     raise BackendUnavailable(
         "neither docker nor podman runs containers here: install one, or start its daemon, or unset $DG4D_EXECUTOR"
@@ -117,7 +117,7 @@ class _Image:
 
 def _image(binary: str, name: str) -> _Image:
     """Look an image up by its name."""
-    answer = _ask([binary, "image", "inspect", name])
+    answer = _query([binary, "image", "inspect", name])
     if answer is None:
         raise BackendUnavailable(
             f"{binary} has no image {name}: build it with `deploy/containers.sh build`, or name another in "
@@ -129,7 +129,7 @@ def _image(binary: str, name: str) -> _Image:
     return _Image(content, published[0] if published else f"{name.partition('@')[0]}@sha256:{content}")
 
 
-def _ask(command: list[str]) -> str | None:
+def _query(command: list[str]) -> str | None:
     """Return the output of an engine command; None if it fails or times out."""
     try:
         done = subprocess.run(

@@ -76,7 +76,7 @@ class Execute(Protocol):
 TAIL_BYTES = 4000  # of standard error, for the message of a crash
 IN_USE = "in-use"  # locked file of a scratch folder
 OUTCOME: TypeAdapter[StepResult | StepFailure] = TypeAdapter(StepResult | StepFailure)
-KILL_GRACE_S = 5.0  # for a killed process to be reaped
+KILL_GRACE_S = 5.0  # wait for a killed process to be reaped
 
 
 _ERRORS: dict[str, type[StepError]] = {  # by the kind of a `StepFailure`
@@ -201,7 +201,7 @@ def configured_executor() -> Execute:
 
 
 def prepare() -> None:
-    """Start the fork server, whose imports the first step would otherwise wait for."""
+    """Start the fork server early, so that the first step does not wait for its imports."""
     if configured_executor() is in_subprocess:
         forks.prepare()
 
@@ -266,7 +266,7 @@ def _relay(line: str, on_progress: Progress, say: Say, on_picture: Show) -> None
 
 
 def _stop(process: Process, end: Callable[[], None]) -> None:
-    """Kill the process group of a step, and what it started elsewhere."""
+    """Kill the process group of a step, and the processes that it started elsewhere."""
     if process.poll() is None:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -274,7 +274,7 @@ def _stop(process: Process, end: Callable[[], None]) -> None:
 
 
 def _outcome(path: Path) -> StepResult | StepFailure | None:
-    """Return what the step wrote; None if it wrote nothing that can be read."""
+    """Return the result or failure that the step wrote; None if there is none, or it is unreadable."""
     with suppress(FileNotFoundError, ValidationError):
         return OUTCOME.validate_json(path.read_bytes())
     return None

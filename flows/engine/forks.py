@@ -108,7 +108,7 @@ class ForkServer:
         stdout = os.fdopen(output, encoding="utf-8", errors="replace")
         try:
             socket.send_fds(self._control, [message], [their_answers.fileno(), their_output, stderr.fileno(), *handles])
-        except OSError:  # the server has ended, which the empty answer below says
+        except OSError:  # the server has ended; the empty answer below reports it
             pass
         finally:
             their_answers.close()

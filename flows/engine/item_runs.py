@@ -147,7 +147,7 @@ class ItemDeployment(NamedTuple):
                     )
                     client.set_flow_run_state(run.id, again, force=True)
             except (httpx.TransportError, PrefectHTTPStatusError):
-                continue  # the run goes on while the server is away
+                continue  # the run continues while the server is unavailable
         return run
 
 

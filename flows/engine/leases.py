@@ -23,7 +23,7 @@ from steps.store.artifact_store import ArtifactStore, Entry
 
 FOLDER = "running"
 FOLDER_LOCK = "collecting.lock"  # without content, which a full disk could not take
-FOLDER_LOCK_S = 1.0  # those who look hold the lock for a moment
+FOLDER_LOCK_S = 1.0  # readers hold the lock briefly
 LOCK = "collecting/lock.json"
 LOCK_S = 900.0  # a lock of another machine is stale if it is not refreshed for so long
 POLL_S = 0.2

@@ -64,7 +64,9 @@ def _failed_gates(result: StepResult) -> list[str]:
 
 def _saved(item: str, ref: ArtifactRef) -> Path | None:
     """Write a picture under a readable name; None if that fails."""
-    return _kept(home.cutouts() / f"{_name(item, ref)}.png", lambda path: home.store().get(ref, path), MOST_PICTURES)
+    return _write_and_prune(
+        home.cutouts() / f"{_name(item, ref)}.png", lambda path: home.store().get(ref, path), MOST_PICTURES
+    )
 
 
 def _saved_page(item: str, ref: ArtifactRef) -> Path | None:
@@ -75,7 +77,7 @@ def _saved_page(item: str, ref: ArtifactRef) -> Path | None:
         with room_for(path.parent):
             path.write_text(page, encoding="utf-8")
 
-    return _kept(home.first_looks() / f"{_name(item, ref)}.html", write, MOST_PAGES)
+    return _write_and_prune(home.first_looks() / f"{_name(item, ref)}.html", write, MOST_PAGES)
 
 
 def _name(item: str, ref: ArtifactRef) -> str:
@@ -83,7 +85,7 @@ def _name(item: str, ref: ArtifactRef) -> str:
     return f"{readable}-{ref.digest.rpartition(':')[2][:DIGITS]}"
 
 
-def _kept(path: Path, write: Callable[[Path], object], most: int) -> Path | None:
+def _write_and_prune(path: Path, write: Callable[[Path], object], most: int) -> Path | None:
     """Write a file atomically with mode 0600, and remove all but the newest ones beside it; None if that fails."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

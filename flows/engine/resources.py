@@ -203,7 +203,7 @@ def _lock_file(folder: Path, resource: Resource, device: str) -> Path:
 
 
 def _name_holder(handle: int, holder: str) -> None:
-    """Write the name of a slot's holder into its file, for those who wait; without room it stays unknown."""
+    """Write the name of a slot's holder into its file, for waiting steps; on a full disk it stays unknown."""
     with suppress(OSError):
         os.truncate(handle, 0)
         os.pwrite(handle, holder.encode(errors="replace"), 0)

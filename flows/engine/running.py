@@ -1,4 +1,4 @@
-"""Execution of a step in its slot with the configured executor; independent of what records the run."""
+"""Execution of a step in its slot with the configured executor; independent of the recording of runs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -77,7 +77,7 @@ def observed_by(observer: StepObserver) -> Iterator[None]:
 
 
 def run_step(step: str, result_type: type[Result], **arguments: Any) -> Result:
-    """Run a step in its slot, emit its events, and tell the observer of this thread.
+    """Run a step in its slot, emit its events, and notify the observer of this thread.
 
     Args:
         step: name in the catalog.

@@ -29,13 +29,13 @@ USUAL_S: Mapping[str, float] = {  # seconds of the profile `preview` on two core
     "pack_asset": 12.0,
     "check_asset": 3.0,
 }
-KNOWN_SHARE = 0.05  # of the expected work, from which on the pace of this run counts
+KNOWN_SHARE = 0.05  # share of the expected work from which the pace of this run is used
 OWN_PACE = 0.1  # fraction of a step, from which on its own pace predicts its end
 SHORT_MINUTES = 2  # up to here times are given in seconds
 
 
 class Schedule:
-    """Steps of one conversion with what is known about their times.
+    """Steps of one conversion with estimates of their times.
 
     Args:
         steps: names of the steps in their order.

@@ -24,13 +24,13 @@ def sharing_results(store: ArtifactStore) -> Iterator[None]:
     keys: set[str] = set()
     _sharing.append((store, keys))
 
-    def put(event: StepEvent) -> None:
+    def share_finished(event: StepEvent) -> None:
         if event.kind == "finished":
             with suppress(StoreUnreachable):  # at worst another machine runs the step again
-                _put(store, keys)
+                _share_results(store, keys)
 
     try:
-        with listening(put):
+        with listening(share_finished):
             yield
     finally:
         _sharing.remove((store, keys))
@@ -55,7 +55,7 @@ def fetch_result(key: str, record: Path) -> None:
 _sharing: list[tuple[ArtifactStore, set[str]]] = []
 
 
-def _put(store: ArtifactStore, keys: set[str]) -> None:
+def _share_results(store: ArtifactStore, keys: set[str]) -> None:
     for key in sorted(keys):
         with suppress(FileNotFoundError):  # of a parallel step that has not finished
             store.write(f"{RESULTS}/{key}", (home.records() / key).read_text(encoding="utf-8"))

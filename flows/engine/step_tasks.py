@@ -201,7 +201,7 @@ class _Progress:
         figures = "".join(f", {name} {format_number(value)}" for name, value in values.items())
         text, percent = f"{self._title}: {done}/{total}{figures}", 100 * done / max(total, 1)
         revive()
-        with suppress(httpx.TransportError):  # the step goes on while the server is away
+        with suppress(httpx.TransportError):  # the step continues while the server is unavailable
             if self._artifact is None:
                 self._artifact = create_progress_artifact(percent, key=self._key, description=text)
             else:

@@ -1,4 +1,4 @@
-"""First-come-first-served queues between the processes of a user: files in order of age, locked by those who wait.
+"""First-come-first-served queues between the processes of a user: files in order of age, locked by their owners.
 
 A ticket is a file whose name sorts by the age of its item, then by its own; the lock of the file ends with its process.
 """
@@ -23,7 +23,7 @@ def ticket(folder: Path, begun_ns: int, holder: str) -> Iterator[Path]:
     Args:
         folder: folder of the queue; created if missing.
         begun_ns: start of the conversion, nanoseconds since the epoch; earlier goes first.
-        holder: name shown to those who wait behind.
+        holder: name shown to later tickets.
 
     Yields:
         The ticket.

@@ -24,7 +24,7 @@ from steps.store.artifact_store import ArtifactStore
 LONGEST_NAME = 60  # characters of a name made from a prompt
 SHAPE_STEPS = {"draw_picture", "prepare_views", "generate_views", "fit_gaussians", "fit_motion"}  # not with `--asset`
 MESH_STEPS = {"plan_mesh", "extract_mesh"}  # not with a mesh as `--asset`
-NAMES = {"item", "profile", "source_name", "picture_name"}  # for people; not part of the digest
+NAMES = {"item", "profile", "source_name", "picture_name"}  # display names; not part of the digest
 
 
 class ConversionRequest(Frozen):
@@ -71,7 +71,7 @@ class ConversionRequest(Frozen):
         return self._must_move or (self._footage is not None and is_video(self._footage))
 
     def unused(self) -> list[str]:
-        """Return sentences about what is given without an effect."""
+        """Return notes about inputs and settings that have no effect."""
         found = []
         if self.picture is not None and self.video is not None:
             found.append(f"{self.picture.name} only names the asset: the subject is that of {self.video.name}")
@@ -269,7 +269,7 @@ class ConversionJob(Frozen):
     """Conversion job, by content; names are for people and not part of its digest.
 
     Attributes:
-        source: picture, video, or frames; the prompt if `drawn`.
+        source: picture, video, or frames; the prompt if `generates_picture`.
         text: that prompt.
         views: pictures of other sides.
         moving: True if `source` is certainly a video.
@@ -297,7 +297,7 @@ class ConversionJob(Frozen):
     picture_name: str = ""
 
     @property
-    def drawn(self) -> bool:
+    def generates_picture(self) -> bool:
         """True if a text-to-image model generates the picture."""
         return bool(self.text)
 

@@ -55,7 +55,7 @@ class ViewsRequest(Frozen):
         return bool(self.views or self.turntable or self.cameras)
 
     def files(self) -> tuple[Path, ...]:
-        """Return the files that are read; those that `cameras` names lie in or below its folder."""
+        """Return the files that are read; those that `cameras` names are in or below its folder."""
         named = (*(view.path for view in self.views), self.turntable, self.cameras)
         return tuple(path for path in named if path is not None)
 

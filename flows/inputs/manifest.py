@@ -183,7 +183,7 @@ def _names(found: list[listing.Found]) -> list[str]:
 
 
 def _kind(path: PurePosixPath) -> str:
-    """Return the suffix that tells files of one name apart."""
+    """Return the suffix that distinguishes files of one name."""
     return path.suffix.lower().lstrip(".")
 
 
@@ -233,12 +233,12 @@ class _Reader:
         return Item(name=name, request=request, priority=priority)
 
     def _request(self, name: str, cells: Mapping[str, Any]) -> ConversionRequest:
-        chosen = cells.get("profile", self.profile)
+        profile_name = cells.get("profile", self.profile)
         return ConversionRequest(
             item=name,
-            profile=chosen,
+            profile=profile_name,
             settings=self._settings(
-                chosen, {**self.changes, **_settings_in(cells), **box_settings(cells.get("box", ""))}
+                profile_name, {**self.changes, **_settings_in(cells), **box_settings(cells.get("box", ""))}
             ),
             seed=_integer("seed", cells.get("seed", self.seed), 0, LARGEST_SEED),
             text=cells.get("text", ""),
@@ -256,10 +256,10 @@ class _Reader:
             ),
         )
 
-    def _settings(self, chosen: str, changes: dict[str, Any]) -> PipelineSettings:
-        key = f"{chosen} {json.dumps(changes, default=str)}"
+    def _settings(self, profile_name: str, changes: dict[str, Any]) -> PipelineSettings:
+        key = f"{profile_name} {json.dumps(changes, default=str)}"
         if key not in self.validated:
-            self.validated[key] = revise(profile(chosen), changes)
+            self.validated[key] = revise(profile(profile_name), changes)
         return self.validated[key]
 
     def _file(self, cells: Mapping[str, Any], column: str) -> Path | None:

@@ -15,9 +15,9 @@ from flows.inputs import json_text
 from flows.inputs.sources import LARGEST_FILE_BYTES, put_zip, resolve_inside
 from steps.catalog import ASSET
 from steps.contract import ArtifactRef
+from steps.sources.media_types import MODEL_SUFFIXES
 from steps.store.artifact_store import ArtifactStore
 
-FORMATS = (".glb", ".gltf", ".obj", ".usdz", ".ply", ".spz")
 MAGIC = {".glb": (b"glTF",), ".usdz": (b"PK",), ".ply": (b"ply",), ".spz": (b"\x1f\x8b", b"NGSP")}
 MOST_REFERENCES = 256  # files that a model may refer to
 LARGEST_TEXT_BYTES = 256 * 2**20  # of a glTF or MTL, which is searched for references
@@ -33,12 +33,12 @@ def check_model(path: Path) -> None:
     Raises:
         BadInput: says what the file is and what to give.
     """
-    allowed = ", ".join(FORMATS)
+    allowed = ", ".join(MODEL_SUFFIXES)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
         raise BadInput(f"--asset: {path} {what}; give a file with one of {allowed}")
     suffix, size = path.suffix.lower(), path.stat().st_size
-    if suffix not in FORMATS:
+    if suffix not in MODEL_SUFFIXES:
         raise BadInput(
             f"--asset: {path} has an unsupported format; give one of {allowed}: export the model as GLB, or splats "
             "as PLY"

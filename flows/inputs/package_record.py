@@ -8,6 +8,7 @@ from flows.inputs.json_text import read_object
 from steps.artifacts.archives import can_exist, stays_inside
 
 RECORD = "provenance.json"
+REPORT = "report.json"  # beside it
 FORMAT = 2  # of the record
 
 

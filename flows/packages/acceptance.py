@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from flows.inputs.package_record import REPORT
 from steps.contract import StepResult
 from steps.store.artifact_store import ArtifactStore
 
@@ -32,7 +33,7 @@ def load_cutout(results: Iterable[StepResult], store: ArtifactStore) -> bytes | 
 def failing_gates(folder: Path) -> list[str] | None:
     """Return the gates that the package in a folder fails, by its report; None if there is no verdict."""
     try:
-        return list(json.loads((folder / "report.json").read_text(encoding="utf-8"))["acceptance"]["failing"])
+        return list(json.loads((folder / REPORT).read_text(encoding="utf-8"))["acceptance"]["failing"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 

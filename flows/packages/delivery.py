@@ -15,7 +15,7 @@ from steps.contract import ArtifactRef, Frozen
 from steps.store.artifact_store import ArtifactStore
 
 FOLDER, RESULTS = "items", "results"
-KEPT_S = 24 * 3600.0  # of an outcome; its package is not protected from `dg4d store gc` for longer either
+KEPT_S = 24 * 3600.0  # lifetime of an outcome; its package is protected from `dg4d store gc` for as long
 PACKED = "application/vnd.dg4d.published+zip"  # a published package, with record, reports and signatures
 
 

@@ -151,7 +151,7 @@ def publish(package: Path, folder: Path, finish: Finish, say: Say = lambda _: No
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """List what commands that were killed while they published left beside a folder, or in it."""
+    """List the scratch folders that killed commands left beside a folder, or in it."""
     folder, left = folder.resolve(), []
     for path in sorted(p for place in (folder.parent, folder) for p in place.glob(f".{glob.escape(folder.name)}.*-*")):
         kind, _, owner = path.name.removeprefix(f".{folder.name}.").partition("-")
@@ -251,7 +251,7 @@ def _is_left_over(owner: str, scratch: Path) -> bool:
 
 
 def _last_change(folder: Path) -> float:
-    """Return when something in a folder was changed last, in seconds since the epoch; infinity if it is gone."""
+    """Return the time of the last change in a folder, in seconds since the epoch; infinity if the folder is gone."""
     times: list[float] = []
     for path in (folder, *walk(folder)):
         with suppress(FileNotFoundError):
@@ -341,7 +341,7 @@ def _move_in(staging: Path, folder: Path, before: Path, say: Say) -> None:
     ours = _ours(folder)
     for name in [*sorted(Path(old) for old in ours - {n.as_posix() for n in new}), *new]:
         if name.as_posix() not in ours:
-            _make_way(staging, folder, name, say)
+            _rename_user_files(staging, folder, name, say)
         if (folder / name).exists():
             (before / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).replace(before / name)
@@ -350,8 +350,8 @@ def _move_in(staging: Path, folder: Path, before: Path, say: Say) -> None:
             (staging / name).replace(folder / name)
 
 
-def _make_way(staging: Path, folder: Path, name: Path, say: Say) -> None:
-    """Rename what the user has under the name of a new file, or of a folder above it; equal files may be replaced."""
+def _rename_user_files(staging: Path, folder: Path, name: Path, say: Say) -> None:
+    """Rename the user's files that have the name of a new file, or of its folder; equal files may be replaced."""
     for place in (*reversed(name.parents), name):
         mine, new = folder / place, staging / place
         if mine.exists() and not (mine.is_dir() and new.is_dir()) and not _is_equal(mine, new):

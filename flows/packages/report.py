@@ -13,7 +13,7 @@ from flows import home
 from flows.formatting.curves import svg_picture
 from flows.formatting.numbers import format_size
 from flows.inputs.conversion_job import ConversionJob
-from flows.inputs.package_record import FORMAT, RECORD
+from flows.inputs.package_record import FORMAT, RECORD, REPORT
 from flows.inputs.signing_key import certificate_digest
 from flows.packages import acceptance
 from flows.packages.acceptance import load_picture, load_verdict
@@ -26,7 +26,7 @@ from flows.packages.view import VIEWER, viewer_html
 from steps.contract import RUN_ONLY
 from steps.store.artifact_store import ArtifactStore
 
-BESIDE = ("report.json", "report.html", VIEWER, CRATE)
+BESIDE = (REPORT, "report.html", VIEWER, CRATE)
 GENERATIVE = (  # steps that generate parts of the asset if they use weights
     "draw_picture", "generate_views", "drive_video", "fit_gaussians", "fit_motion", "refine_texture",
 )  # fmt: skip
@@ -78,7 +78,7 @@ def render_records(
         VIEWER: viewer_html(
             json.loads(written), lambda name: (folder / name).read_bytes()
         ),  # as `dg4d view` will see it
-        "report.json": json.dumps(report, indent=1, ensure_ascii=False) + "\n",
+        REPORT: json.dumps(report, indent=1, ensure_ascii=False) + "\n",
         "report.html": report_page(
             report, load_picture(result.results, store), acceptance.load_cutout(result.results, store)
         ),
@@ -159,8 +159,8 @@ def banner(job: ConversionJob, result: FlowResult) -> str:
     motion = "the motion follows the video" if given else f"the motion was generated{by_model}"
     if job.settings.prior.kind == "oracle":
         return f"Test of the optimization: ground-truth views were given; {motion}."
-    drawn = "the picture was generated from text; " if job.drawn else ""
-    return f"{job.profile.capitalize()}: {drawn}{motion}; {_shape(job, result)}."
+    picture = "the picture was generated from text; " if job.generates_picture else ""
+    return f"{job.profile.capitalize()}: {picture}{motion}; {_shape(job, result)}."
 
 
 def _shape(job: ConversionJob, result: FlowResult) -> str:
@@ -218,7 +218,7 @@ def report_page(report: dict[str, Any], shortcomings: bytes | None = None, cutou
 
 def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
     record = done.result.provenance
-    drawn = [
+    curves = [
         store.load_json(ref)
         for ref in done.result.outputs.values()
         if ref.media_type.endswith("curves+json") and store.has(ref)
@@ -233,7 +233,7 @@ def _stage(done: StepRun, store: ArtifactStore) -> dict[str, Any]:
         "backend": record.backend,
         "notes": [*record.notes, *record.run_notes],
         "flops": record.flops,
-        "curves": drawn,
+        "curves": curves,
     }
 
 

@@ -77,7 +77,7 @@ class ObjectScores(BaseModel):
         object: name.
         error: reason why there are no scores; empty if there are.
         kind: name of the exception of that failure.
-        seconds: compute time of the asset's steps.
+        seconds: compute time of what is scored: up to the motion fit for splats, to the texture for meshes.
         frames: number per view.
         size: of a frame, pixels.
         rows: for every method, values of the input view, of every view, their mean, and of the mesh.
@@ -178,7 +178,7 @@ def markdown(results: Results) -> str:
     several = "One object" if scored == 1 else f"Means over {scored} objects"
     more, means = _present(results, METRICS), _means(results)
     every = [
-        (f"{escaped(one.object)}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
+        (f"{escaped(one.object)}: {display_name(method)}", figures_of(judgment) | _time(one, method == results.ours))
         for one in results.objects
         for method, judgment in one.rows.items()
     ]
@@ -212,7 +212,7 @@ def titled_tables(results: Results) -> list[tuple[str, list[dict[str, str]]]]:
         named.append(("Metrics of the paper", _rows(paper, _means(results), results)))
     if scored > 1:
         every = [
-            (f"{one.object}: {called(method)}", figures_of(judgment) | _time(one, method == results.ours))
+            (f"{one.object}: {display_name(method)}", figures_of(judgment) | _time(one, method == results.ours))
             for one in results.objects
             for method, judgment in one.rows.items()
         ]
@@ -226,12 +226,12 @@ def remarks(results: Results) -> list[str]:
     return [*missing, *(f"{one.object}: {note}" for one in results.objects for note in one.notes)]
 
 
-def scores_page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
+def scores_page(results: Results, videos: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
     """Render the tables and, for every object, the ground-truth videos above those of the asset.
 
     Args:
         results: of the benchmark.
-        films: paths of the videos relative to the page, by object, by source ("truth", "ours") and by view.
+        videos: paths of the videos relative to the page, by object, by source ("truth", "ours") and by view.
     """
     return render(
         "scores.html",
@@ -240,17 +240,17 @@ def scores_page(results: Results, films: Mapping[str, Mapping[str, Mapping[str, 
         table=table(results),
         ours=list(results.mean).index(results.ours) if results.ours in results.mean else None,
         missing=results.missing,
-        objects=[_section(one, results.ours, films.get(one.object, {})) for one in results.objects],
+        objects=[_section(one, results.ours, videos.get(one.object, {})) for one in results.objects],
         quote=quote,
     )
 
 
-def called(method: str) -> str:
+def display_name(method: str) -> str:
     """Return the displayed name of a method."""
     return GUESSES.get(method, method)
 
 
-def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+def _section(one: ObjectScores, ours: str, videos: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
     """Return the values of an object for the page."""
     figures = figures_of(one.rows.get(ours, {}))
     return {
@@ -259,8 +259,8 @@ def _section(one: ObjectScores, ours: str, films: Mapping[str, Mapping[str, str]
         "facts": [
             f"{metric.heading} {figures[key]:.{metric.digits}f}" for key, metric in METRICS.items() if key in figures
         ],
-        "views": list(next(iter(films.values()), {})),
-        "films": films,
+        "views": list(next(iter(videos.values()), {})),
+        "videos": videos,
     }
 
 
@@ -280,7 +280,7 @@ def _time(one: ObjectScores, ours: bool) -> Figures:
 
 
 def _means(results: Results) -> list[tuple[str, Figures]]:
-    return [(called(method), figures) for method, figures in results.mean.items()]
+    return [(display_name(method), figures) for method, figures in results.mean.items()]
 
 
 def _rows(

@@ -63,7 +63,7 @@ class Row(BaseModel):
     failing: list[str] | None = None
 
     @property
-    def made(self) -> bool:
+    def has_package(self) -> bool:
         """True if there is a package, accepted or not."""
         return self.status in {"done", "unchanged"} or self.kind == NOT_ACCEPTED
 
@@ -133,9 +133,9 @@ class Writer:
         self._next = 0.0
 
     def write_sometimes(self, rows: list[Row], seconds: float) -> None:
-        """Call `write` unless that was a moment ago; writing takes a small share of a batch's time.
+        """Call `write` unless it was called recently; writing takes a small share of a batch's time.
 
-        A write that fails, as in a network folder that is away for a moment, leaves the earlier summary.
+        A write that fails, for example in an unavailable network folder, leaves the earlier summary.
         """
         start = time.monotonic()
         if start >= self._next:
@@ -159,7 +159,7 @@ class Writer:
         totals = {name: round(sum(getattr(row, name) for row in rows), 3) for name in ("compute_s", "cpu_s", "gpu_s")}
         summary = {
             "counts": counts,
-            "made": sum(row.made for row in rows),
+            "made": sum(row.has_package for row in rows),
             "not_accepted": [row.item for row in rows if row.failing],
             "commercial_only": self._commercial_only,
             "wall_s": round(seconds, 1),

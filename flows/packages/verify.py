@@ -38,7 +38,7 @@ class Check(Frozen):
 
     @property
     def fault(self) -> bool:
-        """True if the package is not as it was made."""
+        """True if the check found a difference from the recorded package."""
         return self.state in FAULTS
 
 
@@ -56,7 +56,7 @@ class Verification(Frozen):
         return EXIT_MISSING if any(check.state == "unchecked" for check in self.checks) else 0
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """Yield name, state and detail of everything that is not whole, and one row per kind for all that is."""
+        """Yield name, state and detail of every failed check, and one row per kind for the passed ones."""
         for kind, one in (("file", "file"), ("record", "step record"), ("signature", "signature")):
             checks = [check for check in self.checks if check.kind == kind]
             if count := sum(check.state == "whole" for check in checks):

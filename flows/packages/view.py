@@ -14,15 +14,10 @@ from dg4d_lib.errors import BadInput
 from flows.formatting.numbers import format_size
 from flows.inputs.package_record import RECORD
 from flows.packages.publish import load_verified
+from steps.artifacts.package_files import ASSET, DRIVING, MANIFEST, MERGED, SUBJECT, WEB_SPLATS
 from steps.store.files import room_for
 
 VIEWER = "viewer.html"
-# files of a package, as in steps/artifacts/packages.py, whose import would load torch
-MANIFEST = "asset.json"
-ASSET, MERGED = "asset.glb", "asset_merged.glb"
-WEB_SPLATS = "splats/moving.websplats"
-SUBJECT = "input/subject.png"
-DRIVING = "input/driving.mp4"
 WEB_SPLATS_MAGIC = b"D4WS"  # first bytes of web splats, as in dg4d_lib/assets/formats/web_splats.py
 PROVENANCE = ("profile", "seed", "commercial_only", "source", "order", "package")  # fields of the record
 

@@ -56,7 +56,7 @@ def protect(application: ASGIApp) -> ASGIApp:
 
 
 class SameOriginMiddleware:
-    """Refuse requests and WebSockets of foreign pages; tell browsers not to embed or share what is served."""
+    """Refuse requests and WebSockets of foreign pages; forbid browsers to embed or share responses."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

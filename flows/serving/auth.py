@@ -16,7 +16,7 @@ from pathlib import Path
 
 USER = "dg4d"  # Prefect's secret has the form NAME:PASSWORD
 SECRET_BYTES = 32
-SESSION_S = 12 * 3600  # of a browser; the sign-in page renews it silently
+SESSION_S = 12 * 3600  # lifetime of a browser's session; the sign-in page renews it silently
 
 
 def auth_string(folder: Path) -> str:

@@ -63,14 +63,14 @@ AUTOMATIONS = (
 RENAMED = ("dg4d: runs whose process died", "dg4d: runs that died go on")  # names of these in earlier versions
 
 
-def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
+def register(pools: Mapping[str, Pool], pool_names: list[str]) -> list[str]:
     """Create pools, their deployments, and the automations that restart crashed runs; return the deployments' names.
 
     Commands of one user wait for each other: two at a time would create every automation twice.
 
     Args:
         pools: all known pools by name.
-        chosen: names of the pools to create.
+        pool_names: names of the pools to create.
 
     Raises:
         BadInput: a pool is invalid; nothing was changed.
@@ -82,14 +82,14 @@ def register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
                 f"another `dg4d up` or `dg4d studio` has not registered its deployments within {PATIENCE_S:g} s; end "
                 "it, then run this again"
             )
-        return _register(pools, chosen)
+        return _register(pools, pool_names)
 
 
-def _register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
+def _register(pools: Mapping[str, Pool], pool_names: list[str]) -> list[str]:
     with get_client(sync_client=True) as client:
         workers = {kind: worker for types in client.read_worker_metadata().values() for kind, worker in types.items()}
         defaults = {kind: worker["default_base_job_configuration"] for kind, worker in workers.items()}
-        templates = {name: pools[name].template(defaults[pools[name].type]) for name in chosen}
+        templates = {name: pools[name].template(defaults[pools[name].type]) for name in pool_names}
         for name, template in templates.items():
             pool = pools[name]
             wanted = WorkPoolCreate(
@@ -100,7 +100,7 @@ def _register(pools: Mapping[str, Pool], chosen: list[str]) -> list[str]:
                 concurrency_limit=pool.limit,
             )
             client.create_work_pool(wanted, overwrite=True)
-        deployments = [one for one in read_deployments() if one["work_pool"]["name"] in chosen]
+        deployments = [one for one in read_deployments() if one["work_pool"]["name"] in pool_names]
         _deploy(sorted({one["name"] for one in deployments}))
         _automate(client)
         there = {f"{client.read_flow(found.flow_id).name}/{found.name}" for found in client.read_deployments()}
@@ -117,9 +117,9 @@ def _flow_of(deployment: Json) -> str:
 
 def _deploy(names: list[str]) -> None:
     """Run `prefect deploy`, so that the file means the same as with Prefect's own command."""
-    chosen = [word for name in names for word in ("--name", name)]
+    options = [word for name in names for word in ("--name", name)]
     done = subprocess.run(
-        python("-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *chosen),
+        python("-m", "prefect", "--no-prompt", "deploy", "--prefect-file", str(DEPLOYMENTS), *options),
         capture_output=True,
         text=True,
         check=False,

@@ -8,9 +8,8 @@ from pathlib import Path
 from dg4d_lib.errors import BadInput
 from flows.formatting.escaping import visible
 from flows.inputs.json_text import read_object
+from flows.inputs.package_record import RECORD, REPORT
 
-RECORD = "provenance.json"  # of a package
-REPORT = "report.json"
 SUMMARY = "summary.json"  # of a batch
 
 
@@ -26,8 +25,8 @@ class Results:
         self._packages = self._stamps()
         self._failures = self._failed()
 
-    def look(self) -> list[str]:
-        """Return a line for every new or replaced package, and for every new failure, since the last look."""
+    def poll(self) -> list[str]:
+        """Return a line for every new or replaced package, and for every new failure, since the last poll."""
         packages, failures = self._stamps(), self._failed()
         finished = [name for name, stamp in packages.items() if self._packages.get(name) != stamp]
         failed = [name for name, message in failures.items() if self._failures.get(name) != message]
@@ -40,7 +39,7 @@ class Results:
         found: dict[str, int] = {}
         for path in visible_files(self.out):
             if path.name == RECORD:
-                with suppress(OSError):  # it is being replaced
+                with suppress(OSError):  # the package is being replaced
                     found[path.parent.relative_to(self.out).as_posix()] = path.stat().st_mtime_ns
         return found
 

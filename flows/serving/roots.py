@@ -44,8 +44,8 @@ class Roots(Frozen):
         default of `$DG4D_OUTPUTS` are the folders among the sources.
         """
         sources = _sources()
-        outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
-        granted = [*_of_studio(), *_granted()]
+        outputs = _split_roots(os.environ.get(OUTPUTS, "")) or _folders(sources)
+        granted = [*_studio_roots(), *_granted_roots()]
         return cls(
             sources=(*sources, *(place for roots in granted for place in roots.sources)),
             outputs=(*outputs, *(place for roots in granted for place in roots.outputs)),
@@ -146,12 +146,12 @@ def environment(given: Iterable[str] = ()) -> dict[str, str]:
     Raises:
         BadInput: one is not a folder, or its path contains the separator, also after links are resolved.
     """
-    chosen = tuple(given)
-    for place in chosen:
+    selected = tuple(given)
+    for place in selected:
         if not place.startswith(BUCKET) and not Path(place).is_dir():
             raise BadInput(f"--sources {place} is not a folder; give one, or s3://BUCKET/PREFIX")
-    sources = _resolved(chosen) or _sources()
-    outputs = _places(os.environ.get(OUTPUTS, "")) or _folders(sources)
+    sources = _resolve(selected) or _sources()
+    outputs = _split_roots(os.environ.get(OUTPUTS, "")) or _folders(sources)
     for place in (*sources, *outputs):
         if SEPARATOR.search(place):
             raise BadInput(
@@ -171,7 +171,7 @@ def granted(folder: Path, out: Path) -> Iterator[None]:
     os.close(handle)
     place = Path(name).with_suffix(".json")
     with locked(Path(name)):
-        roots = Roots(sources=_resolved([str(folder)]), outputs=_resolved([str(out)]))
+        roots = Roots(sources=_resolve([str(folder)]), outputs=_resolve([str(out)]))
         Path(name).write_text(roots.model_dump_json(), encoding="utf-8")
         Path(name).rename(place)
         try:
@@ -180,13 +180,13 @@ def granted(folder: Path, out: Path) -> Iterator[None]:
             place.unlink(missing_ok=True)
 
 
-def _of_studio() -> Iterator[Roots]:
+def _studio_roots() -> Iterator[Roots]:
     """Yield the folders of the studio page, once it was used: its uploads are read, its packages written."""
     if uploads().is_dir():
-        yield Roots(sources=_resolved([str(uploads())]), outputs=_resolved([str(studio_assets())]))
+        yield Roots(sources=_resolve([str(uploads())]), outputs=_resolve([str(studio_assets())]))
 
 
-def _granted() -> Iterator[Roots]:
+def _granted_roots() -> Iterator[Roots]:
     """Yield the grants of running processes; remove those of processes that have ended."""
     for file in sorted(_grants().glob("*.json")):
         with locked(file, shared=True) as ended:
@@ -203,15 +203,15 @@ def _grants() -> Path:
 def _sources() -> tuple[str, ...]:
     """Return the roots of `$DG4D_SOURCES`, else the current folder, whose path may contain the separator."""
     given = os.environ.get(SOURCES)
-    return _places(given) if given else _resolved([str(Path.cwd())])
+    return _split_roots(given) if given else _resolve([str(Path.cwd())])
 
 
-def _places(text: str) -> tuple[str, ...]:
+def _split_roots(text: str) -> tuple[str, ...]:
     """Split the value of a variable into resolved roots."""
-    return _resolved(place for place in SEPARATOR.split(text) if place)
+    return _resolve(place for place in SEPARATOR.split(text) if place)
 
 
-def _resolved(places: Iterable[str]) -> tuple[str, ...]:
+def _resolve(places: Iterable[str]) -> tuple[str, ...]:
     return tuple(
         place.rstrip("/") if place.startswith(BUCKET) else str(Path(place).expanduser().resolve()) for place in places
     )

@@ -20,22 +20,22 @@ from prefect.exceptions import ObjectNotFound
 
 from dg4d_lib.errors import BackendUnavailable, BadInput, listed
 from flows.formatting.escaping import visible
-from flows.inputs import models
 from flows.inputs.listing import SUFFIXES
 from flows.inputs.rows import MANIFESTS
 from flows.serving.results import check_watched, visible_files
 from steps.contract import digest_of
+from steps.sources.media_types import MODEL_SUFFIXES
 
 CHANGED = "dg4d.folder.changed"  # event of the trigger in deploy/prefect.yaml
 DEPLOYMENT, TRIGGER = "catalog-to-4d/Catalog to 4D", "dg4d catalog of a dropped folder"  # names, likewise
 LONGEST_RESTS = 30  # times `rest_s` that a file at rest waits for others which still change
-NAMED = {*SUFFIXES, *MANIFESTS, *models.FORMATS}  # suffixes of files that the rows of a manifest may name
+NAMED = {*SUFFIXES, *MANIFESTS, *MODEL_SUFFIXES}  # suffixes of files that the rows of a manifest may name
 
 Stamp = tuple[int, int]  # size in bytes, time of the last change in nanoseconds
 
 
 class Watcher:
-    """Watcher of a folder, which tells when a batch of it has something new to convert.
+    """Watcher of a folder for files that a batch has not converted yet.
 
     Only files that the batch reads count: pictures and videos; with a manifest directly in the folder, the manifest and
     models too. All files of a new watcher are new: a batch skips the items that are finished.
@@ -52,11 +52,11 @@ class Watcher:
     def __init__(self, folder: Path, out: Path, rest_s: float) -> None:
         check_watched(folder, out)
         self.folder, self.out, self.rest_s = folder.resolve(), out.resolve(), rest_s
-        self._seen: dict[str, tuple[Stamp, float]] = {}  # with the time of the look that saw it first
-        self._told: dict[str, Stamp] = {}
+        self._seen: dict[str, tuple[Stamp, float]] = {}  # with the time of the poll that found it first
+        self._announced: dict[str, Stamp] = {}
 
-    def look(self, now: float) -> str | None:
-        """Return a digest of the folder's state if new files are at rest; else None.
+    def poll(self, now: float) -> str | None:
+        """Return a digest of the folder's state if there are new, complete files; else None.
 
         Files are announced when all new ones are at rest, or when one has waited `LONGEST_RESTS * rest_s` seconds for
         the others. What is incomplete then fails or is converted as it is, and is announced again when it is at rest.
@@ -69,7 +69,7 @@ class Watcher:
             name: before[name] if name in before and before[name][0] == stamp else (stamp, now)
             for name, stamp in stamps.items()
         }
-        new = [since for name, (stamp, since) in self._seen.items() if self._told.get(name) != stamp]
+        new = [since for name, (stamp, since) in self._seen.items() if self._announced.get(name) != stamp]
         if not new or (now - max(new) < self.rest_s and now - min(new) < LONGEST_RESTS * self.rest_s):
             return None
         return digest_of(stamps)
@@ -88,9 +88,9 @@ class Watcher:
             )
         return self.folder / found[0] if found else self.folder
 
-    def told(self) -> None:
-        """Remember that the files of the last look were announced."""
-        self._told = {name: stamp for name, (stamp, _) in self._seen.items()}
+    def mark_announced(self) -> None:
+        """Mark the files of the last poll as announced."""
+        self._announced = {name: stamp for name, (stamp, _) in self._seen.items()}
 
     def _stamps(self) -> dict[str, Stamp]:
         names = [path.relative_to(self.folder) for path in visible_files(self.folder) if self.out not in path.parents]
@@ -116,8 +116,8 @@ class FailedRuns:
         self.out = str(out)
         self._known: set[UUID] = {run.id for run in self._failed()}
 
-    def look(self) -> list[str]:
-        """Return a line for every run that failed since the last look.
+    def poll(self) -> list[str]:
+        """Return a line for every run that failed since the last poll.
 
         Raises:
             TransportError, PrefectHTTPStatusError: the server does not answer, or refuses.

@@ -43,7 +43,7 @@ class Worker:
         """Output of the worker and its runs."""
         return self.folder / f"worker-{self.pool}.log"
 
-    def is_there(self) -> bool:
+    def is_running(self) -> bool:
         """Return true if its guard runs."""
         with locked(self._file("lock"), shared=True) as free:
             return not free
@@ -56,7 +56,7 @@ class Worker:
 
     def start(self, api_url: str, variables: Mapping[str, str] | None = None) -> None:
         """Start the worker unless it runs, with the environment of this process and these variables."""
-        if self.is_there():
+        if self.is_running():
             return
         child = {**os.environ, **(variables or {})}
         write_atomically(self._file("sources"), child.get(SOURCES, ""))
@@ -71,10 +71,10 @@ class Worker:
 
     def stop(self) -> bool:
         """Stop the worker and its runs; return false if it was not running."""
-        if not self.is_there():
+        if not self.is_running():
             return False
         deadline = time.monotonic() + 2 * GRACE_S
-        while self.is_there() and time.monotonic() < deadline:
+        while self.is_running() and time.monotonic() < deadline:
             with suppress(OSError, ValueError):  # the guard may be starting or exiting
                 os.kill(int(self._file("pid").read_text(encoding="ascii")), signal.SIGTERM)
             time.sleep(0.1)
@@ -149,7 +149,7 @@ def limit(per_worker: int | None) -> dict[str, str]:
 def running(folder: Path) -> list[Worker]:
     """Return the running workers of this machine, sorted by pool."""
     workers = [Worker(lock.stem.removeprefix("worker-"), folder) for lock in sorted(folder.glob("worker-*.lock"))]
-    return [worker for worker in workers if worker.is_there()]
+    return [worker for worker in workers if worker.is_running()]
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

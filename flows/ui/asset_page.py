@@ -91,6 +91,6 @@ def timings(finished: Sequence[StepRun]) -> list[dict[str, str]]:
 
 def curve_picture(values: dict[str, Any]) -> list[str]:
     """Return a loss curve as lines of Markdown; none if it has no values to draw."""
-    drawn = curves.svg_picture(values)
+    plot = curves.svg_picture(values)
     title = f"Losses of the {values['title']}"
-    return [f"## {title}", "", pages.embedded(title, "image/svg+xml", drawn.encode()), ""] if drawn else []
+    return [f"## {title}", "", pages.embedded(title, "image/svg+xml", plot.encode()), ""] if plot else []

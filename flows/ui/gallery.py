@@ -74,18 +74,18 @@ def gallery_page(name: str, line: str, rows: list[Row], out: Path) -> str:
 def _lines(rows: list[Row], out: Path) -> Iterator[str]:
     left = PICTURES_BYTES
     for row in rows:
-        picture = small_picture(out / row.item) if row.made and left > 0 else None
+        picture = small_picture(out / row.item) if row.has_package and left > 0 else None
         left -= len(picture or b"")
         image = pages.embedded("", "image/webp", picture) if picture and left >= 0 else ""
         name = markdown(row.item)
-        item = f"[{name}](/artifacts/key/{pages.key('asset', row.item)})" if row.made else name
+        item = f"[{name}](/artifacts/key/{pages.key('asset', row.item)})" if row.has_package else name
         why = markdown(", ".join(row.failing or ()) or row.message)
         yield f"| {image} | {item} | {verdict(row)} | {row.wall_s:.0f} | {why} |"
 
 
 def verdict(row: Row) -> str:
     """Return the outcome of an item in a word or two."""
-    if not row.made:
+    if not row.has_package:
         return row.status
     return "not accepted" if row.failing else "made" if row.failing is None else "accepted"
 

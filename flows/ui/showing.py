@@ -1,4 +1,4 @@
-"""Artifacts and flows on a Prefect server that may be away for a while, because it was killed or restarts."""
+"""Artifacts and flows on a Prefect server that may be unavailable for a while, because it was killed or restarts."""
 
 import time
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from flows.serving.server import Server, ServerUnavailable
 
 PATIENCE_S = 120.0  # as long as a server may take to start
 POLL_S = 0.5
-MOST_STARTS = 3  # of a flow whose server restarts meanwhile
+MOST_STARTS = 3  # starts of a flow while its server restarts
 
 Result = TypeVar("Result")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from dg4d_lib.errors import BadInput
 
 MOST_ENTRIES = 100_000
-MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries; zipfile reads no more of an entry than its header says
+MOST_UNPACKED_BYTES = 64 * 2**30  # of all entries; zipfile reads no more of an entry than its header declares
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError)
 UNFIT_ERRNOS = {errno.EINVAL, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}  # false offsets and names
 LONGEST_PART_BYTES = 255  # file name, on all common file systems

@@ -10,7 +10,7 @@ Draw = Callable[[], bytes]  # returns a PNG
 
 
 def ignore(_: Draw) -> None:
-    """Show no picture."""
+    """Discard a picture."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Job:
         seed: seed of all random generators of the step.
         progress: callback (done, total, values to show); calls are cheap.
         pictures: folder for pictures that explain a failure.
-        show: callback for a picture of the work so far, PNG; it draws one every few seconds, or none.
+        show: callback for an intermediate picture, PNG; it renders one every few seconds, or none.
     """
 
     inputs: Mapping[str, Path]

@@ -1,4 +1,4 @@
-"""Hardware, packages and weights of this machine, and what each profile lacks. Imports no torch."""
+"""Hardware, packages and weights of this machine, and the missing parts of each profile. Imports no torch."""
 
 import os
 import re
@@ -26,7 +26,7 @@ NVIDIA_DRIVER = Path("/proc/driver/nvidia/version")
 MEMORY = Path("/proc/meminfo")
 TORCH_TIMEOUT_S = 120  # for the import of torch in a process of its own
 CORE = ("torch", "numpy", "scipy", "numba", "av", "OpenImageIO", "PIL", "skimage", "trimesh", "xatlas", "pymeshlab")
-NETWORKS = ("diffusers", "transformers", "accelerate", "safetensors")  # of profiles with weights
+NETWORKS = ("diffusers", "transformers", "accelerate", "safetensors")  # packages that profiles with weights need
 SHOWN = ("torch", "gsplat", "diffusers", "transformers", "av")  # packages whose versions are shown
 SETUP, SETUP_CUDA = "make setup", "make setup CUDA=1"
 GIB = 2**30
@@ -121,7 +121,7 @@ class Readiness(Frozen):
 
 
 def examine_machine() -> Machine:
-    """Return what this machine has; torch is started in another process, and only where there is a GPU."""
+    """Examine the hardware and software of this machine; torch is started in another process, and only with a GPU."""
     gpus = tuple(Gpu(name=one.name, memory_gib=round(one.memory_bytes / GIB, 1)) for one in cuda_devices())
     folder = weights_home()
     return Machine(
@@ -142,7 +142,7 @@ def examine_machine() -> Machine:
 
 
 def examine_profile(name: str, machine: Machine) -> Readiness:
-    """Return what a profile needs and lacks on a machine."""
+    """Compare the needs of a profile with a machine."""
     tree = PROFILES[name].model_dump(mode="json")
     weights = tuple(_weights_state(one) for one in weights_in(tree))
     absent = [one for one in weights if one.state != "here"]

@@ -37,7 +37,7 @@ class BankView(_Strict):
         azimuth: degrees, 0 is the input view.
         elevation: degrees, positive above.
         radius: distance from the origin, world units.
-        weight: reliability of the pictures; below 1 for drawn ones that disagree with others.
+        weight: reliability of the pictures; below 1 for generated ones that disagree with others.
     """
 
     file: str = Field(min_length=1)

@@ -6,7 +6,7 @@ import OpenImageIO as oiio
 
 from dg4d_lib.errors import quoted
 
-DEPTH_NAMES = ("z", "depth", "depth.z", "depth.v")  # of channels, or their ends after a dot; before red, green and blue
+DEPTH_NAMES = ("z", "depth", "depth.z", "depth.v")  # names or their last parts; preferred to red, green and blue
 MAIN_LAYERS = {"combined", "beauty", "rgba"}  # names of the finished picture among render passes
 
 
@@ -34,7 +34,7 @@ def find_channels(spec: oiio.ImageSpec, depth: bool = False) -> Channels:
     colored = [layer for layer, ends in layers.items() if {"r", "g", "b"} <= set(ends.values())]
 
     def rank(layer: str) -> tuple[bool, bool, bool]:
-        """Prefer channels without a layer, then a finished picture, then the owner of alpha."""
+        """Rank a layer: channels without a layer first, then a finished picture, then a layer with alpha."""
         return not layer, not MAIN_LAYERS.isdisjoint(layer.split(".")), spec.alpha_channel in layers[layer]
 
     layer = max(colored or layers, key=rank)  # the first one of equals

@@ -21,7 +21,7 @@ from steps.sources.stills import StillValues, read_values
 
 LARGEST_SIDE = 256  # pixels: outlines and depths need no more
 MOST_TINT = 0.02  # mean difference of the color channels of a gray picture: JPEG leaves less
-SPARSE = 0.95  # share of the subject with values, below which the report says it
+SPARSE = 0.95  # share of the subject with values, below which the report has a note
 ONE_PICTURE = "give one gray picture of the first frame (PNG, TIFF, EXR)"
 
 

@@ -38,8 +38,8 @@ def read_mask(
         raise BadInput(f"--mask: {error}") from error
     if mask.size != source.size:
         raise BadInput(
-            f"--mask is {_by(mask.size)} pixels, the {source.kind} {_by(source.size)}; draw the mask at the size of "
-            f"the {source.kind}"
+            f"--mask is {_format_size(mask.size)} pixels, the {source.kind} {_format_size(source.size)}; draw the mask "
+            f"at the size of the {source.kind}"
         )
     if mask.count != source.count:
         given = f"--mask has {mask.count} frame{'s' * (mask.count != 1)}"
@@ -89,5 +89,5 @@ def scaled_box(box: tuple[int, ...], source: Source) -> tuple[int, ...]:
     return left, top, right - left, bottom - top
 
 
-def _by(size: tuple[int, int]) -> str:
+def _format_size(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"

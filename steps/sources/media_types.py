@@ -52,6 +52,7 @@ PICTURE_SUFFIXES = {
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".exr", ".hdr", ".jxl", ".jp2", ".psd", ".ppm",
     ".pgm",
 }  # fmt: skip
+MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".usdz", ".ply", ".spz")
 SCENE_SUFFIXES = {".usd", ".usda", ".usdc"}  # layers of a USDZ, which is a zip of a scene and its textures
 CLUTTER = {"Thumbs.db", "desktop.ini"}  # files that Windows adds to folders
 NPY = b"\x93NUMPY"

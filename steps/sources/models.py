@@ -27,9 +27,9 @@ from dg4d_lib.gaussians.merging import merge_gaussians
 from dg4d_lib.mesh.models.model import Model
 from steps.artifacts.archives import stays_inside, unpack
 from steps.sources.decode_limit import DecodeLimit
+from steps.sources.media_types import MODEL_SUFFIXES
 
 MODEL = "model"  # name of the main file, before its suffix
-FORMATS = (".glb", ".gltf", ".obj", ".usdz", ".ply", ".spz")
 DATA_URI = "data:"
 
 
@@ -68,8 +68,10 @@ def read_model(path: Path, scratch: Path, settings: AssetSettings, max_decode_gb
     limit.require_file(path, "the model")
     names = unpack(path, scratch, "the model", lambda name: True)
     main = [name for name in names if Path(name).parent == Path() and Path(name).stem == MODEL]
-    if len(main) != 1 or Path(main[0]).suffix not in FORMATS:
-        raise BadInput(f"the model must be one of {', '.join(FORMATS)}; given {', '.join(names[:5]) or 'nothing'}")
+    if len(main) != 1 or Path(main[0]).suffix not in MODEL_SUFFIXES:
+        raise BadInput(
+            f"the model must be one of {', '.join(MODEL_SUFFIXES)}; given {', '.join(names[:5]) or 'nothing'}"
+        )
     file = scratch / main[0]
     with limit.enforced("the model"):
         own = _read(file, settings)
@@ -87,7 +89,7 @@ def _read(file: Path, settings: AssetSettings) -> OwnModel:
             return _mesh(embed_files(file), settings)
         case ".obj":
             text = file.read_bytes().decode("utf-8-sig", "replace")
-            model = read_obj(text, lambda name: _beside(file.parent, name), decode_picture, settings.max_faces)
+            model = read_obj(text, lambda name: _read_sibling(file.parent, name), decode_picture, settings.max_faces)
             return _converted(model, settings, ("y", "z"))
         case _:
             usd: Any = import_module("dg4d_lib.assets.formats.usd_model")  # the USD library starts slowly
@@ -106,7 +108,7 @@ def _merged(own: OwnModel, most: int) -> OwnModel:
 def _ply(content: bytes, folder: Path, settings: AssetSettings) -> OwnModel:
     """Return a mesh where the file has faces, and splats where it has none."""
     if declared_faces(content):
-        model = read_ply_mesh(content, lambda name: _beside(folder, name), decode_picture, settings.max_faces)
+        model = read_ply_mesh(content, lambda name: _read_sibling(folder, name), decode_picture, settings.max_faces)
         return _converted(model, settings, ("y", "z"))
     splats, notes = read_foreign_ply(content)
     return OwnModel(splats=splats, ups=("-y", "y", "z"), notes=notes)  # 3DGS has y down
@@ -123,7 +125,7 @@ def _mesh(content: bytes, settings: AssetSettings, ups: tuple[str, ...] = ("y",)
     return OwnModel(content=content, glb=glb, ups=ups, notes=glb.notes)
 
 
-def _beside(folder: Path, name: str) -> bytes | None:
+def _read_sibling(folder: Path, name: str) -> bytes | None:
     """Return the content of a file beside the model; None if there is none."""
     cleaned = name.replace("\\", "/").removeprefix("./")
     if not stays_inside(cleaned) or not os.path.isfile(folder / cleaned):  # noqa: PTH113 (any length of the name)
@@ -215,7 +217,7 @@ def _content(uri: str, folder: Path, what: str) -> bytes:
             return base64.b64decode(text, validate=True) if header.endswith(";base64") else unquote(text).encode()
         except binascii.Error as error:
             raise ValueError(f"a data URI cannot be decoded: {error}") from error
-    data = _beside(folder, unquote(uri))
+    data = _read_sibling(folder, unquote(uri))
     if data is None:
         raise BadInput(f"the {what} {uri[:80]!r} of the model is missing; put it beside the model, or export it as GLB")
     return data

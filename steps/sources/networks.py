@@ -20,7 +20,7 @@ class LoadedNetwork:
 
 
 def open_network(matting: str) -> LoadedNetwork:
-    """Return the network of `subject.matting`: U2-Netp, unless the setting names other weights; loads nothing yet.
+    """Return the network of `subject.matting`: U2-Netp unless the setting names other weights; it is loaded later.
 
     Raises:
         BadInput: the name is unknown.

@@ -41,7 +41,7 @@ def place_pictures(
             pixels a side.
 
     Raises:
-        BadInput: the cameras look away from the subject, from above, or two of them are one; or a picture has another
+        BadInput: a camera faces away from the subject or is above it, or two are equal; or a picture has another
             shape than that of its camera.
     """
     assert given.input_camera is not None, "placed views need the camera of the input"

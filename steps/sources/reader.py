@@ -80,7 +80,7 @@ def read_source(
     Args:
         path: file with any name.
         scratch: existing folder for links and unpacked pictures.
-        max_frames: number of frames to keep of a video, evenly spaced with first and last; at least 2.
+        max_frames: number of frames to keep of a video, as `evenly_spaced` chooses them; at least 2.
         max_decode_gb: memory limit in GiB, which includes the decoded frames.
 
     Raises:

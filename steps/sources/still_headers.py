@@ -84,17 +84,17 @@ def _jpegxl(head: bytes) -> Header | None:
             return None
     bits = int.from_bytes(head[at + 2 : at + 18], "little")
 
-    def take(count: int) -> int:
+    def read_bits(count: int) -> int:
         """Return the next bits, lowest first."""
         nonlocal bits
         value, bits = bits & ((1 << count) - 1), bits >> count
         return value
 
-    def side() -> int:
-        return 8 * (take(5) + 1) if small else take(JXL_SIZE_BITS[take(2)]) + 1
+    def read_side() -> int:
+        return 8 * (read_bits(5) + 1) if small else read_bits(JXL_SIZE_BITS[read_bits(2)]) + 1
 
-    small = take(1)
-    height = side()
-    ratio = take(3)
-    width = height * JXL_RATIOS[ratio - 1][0] // JXL_RATIOS[ratio - 1][1] if ratio else side()
+    small = read_bits(1)
+    height = read_side()
+    ratio = read_bits(3)
+    width = height * JXL_RATIOS[ratio - 1][0] // JXL_RATIOS[ratio - 1][1] if ratio else read_side()
     return Header(width, height, 6)

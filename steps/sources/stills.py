@@ -39,7 +39,7 @@ FLOATS = ("half", "float", "double")
 HALF = 0.5  # alpha from which a pixel has a value
 WINDOWED_FORMATS = ("openexr",)  # data and display windows differ; offsets of TIFF and PNG are places on a page
 LINEAR_FORMATS = ("openexr", "hdr")
-PREMULTIPLIED_FORMATS = ("openexr", "tiff")  # unless a file says otherwise
+PREMULTIPLIED_FORMATS = ("openexr", "tiff")  # default without a declaration in the file
 FAINT_ALPHA = 1e-3  # premultiplied colors are divided by no smaller alpha
 
 AVIF_BYTES = 20  # per pixel: planes of up to 16 bits, and two 8-bit RGBA copies of Pillow's

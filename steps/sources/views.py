@@ -18,7 +18,7 @@ LARGEST_JSON = 16 * 2**20  # bytes
 MOST_VIEWS = 64  # pictures or cameras
 CLOSE_DEG = 2.0  # two views nearer to each other count as one
 LARGEST_AZIMUTH_DEG = 360.0
-HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth says nothing
+HIGHEST_DEG = 80.0  # elevation; near a pole the azimuth is undefined
 OTHER_SHAPE = 0.02  # ratio of width to height by which picture and camera may differ: rounding after shrinking
 DISTORTED = 0.05  # largest lens distortion coefficient that is ignored
 Side = Annotated[int, Field(gt=0, le=1_000_000)]  # of a picture, pixels

@@ -26,11 +26,11 @@ OBJECTS, INCOMING = "sha256", "incoming"
 
 
 class ArtifactMissing(DG4DError):
-    """An artifact that is gone or damaged; running the step again restores it."""
+    """Missing or damaged artifact; running the step again restores it."""
 
 
 class StoreUnreachable(BackendUnavailable):
-    """An object store that does not answer at the moment; a retry may succeed."""
+    """Object store that does not answer; a retry may succeed."""
 
 
 class Entry(NamedTuple):
@@ -85,7 +85,7 @@ class ArtifactStore:
         return self._put(io.BytesIO(content), media_type)
 
     def get(self, ref: ArtifactRef, path: Path) -> None:
-        """Write an artifact to `path`, as a file that may be changed without harm to the store.
+        """Copy an artifact to `path`; changes of the copy do not affect the store.
 
         Raises:
             ArtifactMissing: it is not here, or its bytes do not match its digest (then it is dropped).
@@ -101,7 +101,7 @@ class ArtifactStore:
         """Return True if the artifact is here with its full size."""
         try:
             with self._allowed():
-                return self._place(ref.digest).stat().st_size == ref.size_bytes
+                return self._path_of(ref.digest).stat().st_size == ref.size_bytes
         except FileNotFoundError:
             return False
 
@@ -142,7 +142,7 @@ class ArtifactStore:
     def content_digest(self, digest: str) -> str | None:
         """Return the true digest of the bytes stored under a digest; None if there are none."""
         try:
-            with self._allowed(), self._place(digest).open("rb") as file:
+            with self._allowed(), self._path_of(digest).open("rb") as file:
                 return _digest(file)
         except FileNotFoundError:
             return None
@@ -201,7 +201,7 @@ class ArtifactStore:
                 (self.root / name).unlink(missing_ok=True)
 
     def tidy(self, unused_s: float) -> None:
-        """Remove partial files of killed processes that nobody has used for so many seconds."""
+        """Remove partial files of killed processes that are unused for this many seconds."""
         remove_unused(self.root / INCOMING, unused_s)
 
     def _new_file(self, name: str) -> Path:
@@ -210,12 +210,12 @@ class ArtifactStore:
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
-    def _place(self, digest: str) -> Path:
+    def _path_of(self, digest: str) -> Path:
         return self.root / object_name(digest)
 
     def _is_right(self, ref: ArtifactRef) -> bool:
         """Return True if the file of an artifact matches its digest."""
-        place = self._place(ref.digest)
+        place = self._path_of(ref.digest)
         try:
             with self._allowed(), place.open("rb") as file:
                 version = _version(os.fstat(file.fileno()))
@@ -231,7 +231,7 @@ class ArtifactStore:
         """Return the file of an artifact, which has the right size."""
         if not self.has(ref):
             raise self._missing(ref)
-        return self._place(ref.digest)
+        return self._path_of(ref.digest)
 
     def _opened(self, ref: ArtifactRef) -> BinaryIO:
         with self._allowed():
@@ -257,7 +257,7 @@ class ArtifactStore:
 
     def _damaged(self, ref: ArtifactRef) -> ArtifactMissing:
         """Drop the file of an artifact and return the error to raise."""
-        self._place(ref.digest).unlink(missing_ok=True)
+        self._path_of(ref.digest).unlink(missing_ok=True)
         return ArtifactMissing(
             f"artifact {ref.digest} ({ref.media_type}) was damaged: run the same command again to renew it"
         )
@@ -273,7 +273,7 @@ class ArtifactStore:
 
     def _renewed(self, ref: ArtifactRef) -> bool:
         """Return True if the artifact is here and sound; garbage collection then counts its age from now on."""
-        place = self._place(ref.digest)
+        place = self._path_of(ref.digest)
         with suppress(FileNotFoundError, PermissionError):  # it was removed meanwhile, or cannot be renewed
             if self._is_right(ref):
                 os.utime(place)
@@ -316,7 +316,7 @@ def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def remove_unused(folder: Path, unused_s: float) -> None:
-    """Remove the files of a folder that nobody has read or written for so many seconds."""
+    """Remove the files of a folder that were not read or written for this many seconds."""
     for path, status in _files(folder):
         if time.time() - max(status.st_mtime, status.st_atime) > unused_s:
             path.unlink(missing_ok=True)
@@ -327,7 +327,7 @@ def _digest(file: io.BufferedReader) -> str:
 
 
 def _version(status: os.stat_result) -> tuple[int, int, int]:
-    """Return what changes when a file does: inode, time and size."""
+    """Return the version of a file: inode, time and size."""
     return status.st_ino, status.st_mtime_ns, status.st_size
 
 

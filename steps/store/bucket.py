@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 CONNECT_S = 10.0  # time limit of a connection attempt
 YES = {"1", "on", "true", "y", "yes"}  # values of $AWS_ALLOW_HTTP, as obstore reads it
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # between two attempts
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0  # pauses between attempts, seconds
 MOST_ATTEMPTS = 10_000  # more than fit into any time limit
 READ_AHEAD = 8 * CHUNK  # bytes per request for a part of an artifact
 RENEW_S = 3600.0  # less than the grace of `dg4d store gc`, by more than clocks of machines differ
@@ -84,7 +84,7 @@ class BucketStore(ArtifactStore):
         """Remove artifacts from the bucket, and their copies."""
         super().drop(digests)
         for digest in digests:
-            self._place(digest).unlink(missing_ok=True)
+            self._path_of(digest).unlink(missing_ok=True)
 
     def now(self) -> float:
         """Return the time of the object store's clock, in seconds."""
@@ -142,7 +142,7 @@ class BucketStore(ArtifactStore):
                 obstore.delete(self._bucket, list(names))
 
     def tidy(self, unused_s: float) -> None:
-        """Remove partial files on this machine, and copies that nobody has read for so many seconds."""
+        """Remove partial files on this machine, and copies that were not read for this many seconds."""
         super().tidy(unused_s)
         remove_unused(self.root / OBJECTS, unused_s)
 
@@ -155,7 +155,7 @@ class BucketStore(ArtifactStore):
         modified = self._modified(ref)
         if modified is None or time.time() - modified > RENEW_S:
             with self._writing():
-                obstore.put(self._bucket, object_name(ref.digest), self._place(ref.digest))
+                obstore.put(self._bucket, object_name(ref.digest), self._path_of(ref.digest))
         return ref
 
     def _modified(self, ref: ArtifactRef) -> float | None:
@@ -171,7 +171,7 @@ class BucketStore(ArtifactStore):
         """Return the copy of an artifact, fetched if it is not here or damaged."""
         if not (super().has(ref) and self._is_right(ref)):
             self._fetch(ref)
-        place = self._place(ref.digest)
+        place = self._path_of(ref.digest)
         os.utime(place, (time.time(), place.stat().st_mtime))  # `tidy` keeps copies that were used
         return place
 
@@ -183,7 +183,7 @@ class BucketStore(ArtifactStore):
         except FileNotFoundError as error:
             raise self._missing(ref) from error
         if copy.digest != ref.digest:
-            self._place(copy.digest).unlink(missing_ok=True)
+            self._path_of(copy.digest).unlink(missing_ok=True)
             self.drop([ref.digest])
             raise self._damaged(ref)
 

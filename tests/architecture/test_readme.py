@@ -14,7 +14,7 @@ from dg4d_lib.assets.scenes.scene import Scene, SceneItem
 from flows.inputs.manifest import parse_changes
 from flows.inputs.package_record import RECORD
 from flows.packages.report import BESIDE
-from steps.artifacts import packages
+from steps.artifacts import package_files
 from steps.profiles import PROFILES, profile, revise
 from steps.sources.banks import BankIndex
 
@@ -182,7 +182,7 @@ def test_the_exit_codes_are_those_of_the_command() -> None:
 
 
 def test_every_file_of_a_package_is_explained() -> None:
-    names = [value for name, value in vars(packages).items() if name.isupper() and isinstance(value, str)]
+    names = [value for name, value in vars(package_files).items() if name.isupper() and isinstance(value, str)]
     assert len(names) > 5
     assert not [name for name in (*names, RECORD, *BESIDE) if f"`{name}" not in repository.text("docs/package.md")]
 

@@ -5,14 +5,20 @@ from shutil import copytree
 
 import pytest
 import torch
+from tiny_weights import write_zero123
 
+from benchmarks import ablations, fits
 from benchmarks.ablations import ABLATIONS, IMPERFECT, QUICK, Ablation, Claim, Row, Variant, main, settings_of, verdict
 from benchmarks.fits import Figures, fits_per_frame, moving_fit, score, static_fit, subsample_frames
 from benchmarks.objects.specimens import Specimen
 from dg4d_lib.cameras.orbit import OrbitCamera
+from dg4d_lib.errors import BadInput
+from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.gaussians.initialize import isotropic
+from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.rasterizer.interface import get_rasterizer
+from dg4d_lib.settings import LgmStartSettings
 from steps.artifacts.media import write_png
 
 SIZE, FRAMES = 32, 4
@@ -69,6 +75,68 @@ def test_every_frame_can_be_fitted_for_itself(specimen):
     alone = fits_per_frame(specimen, settings_of(CHANGES, SIZE, FRAMES), 0)
     assert len(alone) == FRAMES
     assert score(specimen, alone).psnr_obj > score(specimen, [alone[0]] * FRAMES).psnr_obj
+
+
+def test_every_frame_can_be_fitted_from_the_static_stage(specimen, monkeypatch):
+    starts = []
+
+    def fit(start: Gaussians, subject: torch.Tensor, *_: object) -> Gaussians:
+        starts.append((start, subject))
+        return start
+
+    monkeypatch.setattr(fits, "fit_gaussians", fit)
+    rest = ball(0)
+    fits_per_frame(specimen, settings_of(CHANGES, SIZE, FRAMES), 0, start=rest)
+    assert len(starts) == FRAMES and all(start is rest for start, _ in starts)
+    assert all(torch.equal(subject, specimen.cutouts[frame]) for frame, (_, subject) in enumerate(starts))
+    ablations.Laboratory(CHANGES, SIZE).figures(specimen, Variant(per_frame=True, from_static=True), 0, still=False)
+    first, *others = [len(start) for start, _ in starts[FRAMES:]]
+    assert others == [first] * FRAMES and all(start is starts[FRAMES][0] for start, _ in starts[FRAMES:])
+
+
+def test_an_imperfect_oracle_has_the_same_errors_of_a_frame_in_every_fit(specimen, monkeypatch):
+    still = specimen.bank.pictures[:, :1].expand(-1, FRAMES, -1, -1, -1)
+    subject = replace(specimen, bank=replace(specimen.bank, pictures=still))  # only the errors differ between frames
+    seen = list[GuidancePrior]()
+
+    def fit_first(start: Gaussians, subject: torch.Tensor, prior: GuidancePrior, *_: object) -> Gaussians:
+        seen.append(prior)
+        return start
+
+    def fit_all(rest: Gaussians, field: object, video: object, prior: GuidancePrior, *_: object) -> Gaussians:
+        seen.append(prior)
+        return rest
+
+    monkeypatch.setattr(fits, "fit_gaussians", fit_first)
+    monkeypatch.setattr(fits, "fit_motion", fit_all)
+    errors = {"prior.color_gain": 0.2, "prior.pose_deg": 4.0}
+    settings = settings_of({**CHANGES, **errors}, SIZE, FRAMES)
+    half = settings_of({**CHANGES, **errors, "subject.max_frames": 2}, SIZE, FRAMES)
+    fits_per_frame(subject, settings, 0)
+    rest = static_fit(subject, settings, 0)
+    for chosen in (settings, half):
+        moving_fit(subject, rest, chosen, 0)
+    assert len({prior.viewpoints for prior in seen}) == 1
+
+    def color(prior: GuidancePrior, frame: int) -> list[float]:
+        camera = replace(prior.viewpoints[1], width=SIZE, height=SIZE)
+        return prior.clean([GuidanceView(camera, frame)])[0].mean((0, 1, 2)).tolist()
+
+    *single, static, whole, sparse = seen
+    wanted = [color(whole, frame) for frame in range(FRAMES)]
+    assert len({tuple(values) for values in wanted}) == FRAMES
+    assert [color(prior, 0) for prior in single] == wanted and color(static, 0) == wanted[0]
+    assert [color(sparse, frame) for frame in (0, 1)] == [wanted[0], wanted[2]]
+
+
+def test_another_prior_than_the_oracle_is_conditioned_on_the_cut_outs(specimen):
+    few = {**CHANGES, "prior.kind": "geometric", "static.iterations": 1, "motion.iterations": 1}
+    settings = settings_of(few, SIZE, FRAMES)
+    rest = static_fit(specimen, settings, 0)
+    assert len(moving_fit(specimen, rest, settings, 0)) == FRAMES
+    with pytest.raises(BadInput, match=r"static.start.kind is lgm; these fits start with blob or surface"):
+        lgm = settings.static.model_copy(update={"start": LgmStartSettings()})
+        static_fit(specimen, settings.model_copy(update={"static": lgm}), 0)
 
 
 def test_half_of_the_frames_are_every_second_one(specimen):
@@ -164,6 +232,37 @@ def test_a_data_set_is_fitted_and_scored_as_the_objects_are(dataset, specimen, m
     assert found["1 view, white"]["figures"]["terr"] is None
 
 
+@pytest.mark.slow
+def test_a_diffusion_prior_runs_the_ablations_without_the_caveats_of_the_oracle(dataset, tmp_path, monkeypatch, capsys):
+    weights = write_zero123(tmp_path / "zero123")
+    words = ["--set=prior.kind=zero123", f"--set=prior.weights={weights}", "--quick", "--objects=balls"]
+    few = ["--set=static.iterations=2", "--set=motion.iterations=2", "--set=static.views=1", "--set=motion.views=1"]
+    called(monkeypatch, "noise", f"--data={dataset}", *words, *few)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "T_max 0.98" in printed and "Not decided: in the dynamic stage" in printed
+
+
+def test_objects_may_stand_before_the_names_of_ablations_as_in_the_usage(monkeypatch):
+    given = []
+    monkeypatch.setattr(ablations, "run", lambda options, console: given.append(options))
+    called(monkeypatch, "--objects", "newt,parrot", "static", "noise")
+    assert given[0].objects == ["newt", "parrot"] and given[0].names == ["static", "noise"]
+
+
+@pytest.mark.parametrize("base", [{}, QUICK, {"static.iterations": 500, "motion.iterations": 200}])
+def test_longer_fits_are_as_much_longer_whatever_the_base(base):
+    recipe = ABLATIONS["recipe"].variants
+
+    def iterations(name: str) -> tuple[int, int]:
+        variant = recipe[name]
+        settings = settings_of({**base, **variant.changes}, SIZE, 8, variant.factors)
+        return settings.static.iterations, settings.motion.iterations
+
+    static, motion = iterations("paper")
+    assert iterations("and twice as long") == (static, 2 * motion)
+    assert iterations("and a longer static stage") == (2 * static, 2 * motion)
+
+
 def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsys):
     for words, message in (
         (["noise", f"--data={dataset}", "--objects", "cat"], "unknown objects cat; choose from balls, picture"),
@@ -173,6 +272,7 @@ def test_what_cannot_be_run_is_refused_with_what_can(dataset, monkeypatch, capsy
         (["static", "--seeds", "0"], "--seeds is 0; give at least 1"),
         (["static", "--frames", "0"], "--frames is 0; give at least 1"),
         (["static", "--size=-3"], "--size is -3; give at least 1"),
+        (["noise", f"--data={dataset}", "--objects=balls", "--set=prior.kind=zero123"], "dg4d weights pull"),
     ):
         with pytest.raises(SystemExit) as ended:
             called(monkeypatch, *words)

@@ -310,7 +310,7 @@ SCORES: dict[str, Any] = {
     "table": [{str(n): "0.123" for n in range(10)}], "missing": {"LPIPS": "no weights"},
     "objects": [
         {"name": "fox", "error": "", "facts": ["PSNR 30"], "views": ["input", "view_90"],
-         "films": {"truth": {}, "ours": {}}},
+         "videos": {"truth": {}, "ours": {}}},
         {"name": "owl", "error": "The package is damaged."},
     ],
 }  # fmt: skip

@@ -103,7 +103,7 @@ def undrawn(gem: Path) -> Asset:
         raise AssertionError("rendered")
 
     asset = dg4d.load(gem)
-    vars(asset).update(_draw_gaussians=draw, _draw_mesh=draw)
+    vars(asset).update(_render_gaussians=draw, _render_mesh=draw)
     return asset
 
 

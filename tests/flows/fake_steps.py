@@ -185,7 +185,7 @@ def join_meshes(job: Job) -> StepReport:
 
 def refine_texture(job: Job) -> StepReport:
     name = "tracked" if "tracked" in job.inputs else "meshes"
-    _begin("refine_texture", job, job.inputs[name].read_bytes())
+    _begin("refine_texture", job, job.inputs["subject"].read_bytes()[len(PNG) :])
     job.outputs[name].write_bytes(job.inputs[name].read_bytes())
     return StepReport()
 

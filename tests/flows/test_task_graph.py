@@ -227,3 +227,18 @@ def test_a_picture_passes_few_modules_on_its_way_to_the_steps_and_into_the_folde
 def test_textures_are_refined_by_a_step_only_where_a_model_is_asked_for(log: Path, tmp_path: Path) -> None:
     convert_job(job("refined", tmp_path), tmp_path / "out")
     assert "refine_texture" not in ran(log)
+
+
+@pytest.mark.parametrize("maker", ["prepare_subject", "prepare_asset"])
+def test_the_refinement_sees_the_input_picture_or_the_render_of_the_users_model(
+    maker: str, log: Path, tmp_path: Path
+) -> None:
+    settings = revise(PREVIEW, {"refiner.kind": "video_to_video"})
+    (tmp_path / "a.png").write_text(picture("refined by a model"))
+    (tmp_path / "a.glb").write_bytes(b"glTF refined")
+    own = {"asset": tmp_path / "a.glb"} if maker == "prepare_asset" else {"picture": tmp_path / "a.png"}
+    request = ConversionRequest(item="refined", settings=settings, **own)
+    convert_job(request.to_job(home.store()), tmp_path / "out")
+    assert "refine_texture" in ran(log)
+    steps = {step["step"]: step for step in json.loads((tmp_path / "out" / "provenance.json").read_text())["steps"]}
+    assert steps["refine_texture"]["inputs"]["subject"] == steps[maker]["outputs"]["subject"]

@@ -6,10 +6,20 @@ import pytest
 from pydantic import ValidationError
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.guidance.imagedream import RING
 from dg4d_lib.rasterizer import backends
 from dg4d_lib.reconstruction.lgm import WORLD_SCALE
 from dg4d_lib.settings import Zero123PriorSettings
-from steps.profiles import PREVIEW, PROFILES, RENAMED_SETTINGS, PipelineSettings, profile, revise, step_settings
+from steps.profiles import (
+    IMAGEDREAM_RING,
+    PREVIEW,
+    PROFILES,
+    RENAMED_SETTINGS,
+    PipelineSettings,
+    profile,
+    revise,
+    step_settings,
+)
 from steps.runtime.weights import license_of, weights_in
 
 
@@ -107,6 +117,8 @@ PAPER = {"static.iterations": 500, "static.views": 16, "static.t_max_start": 0.9
          "mesh.mode": "per_frame", "mesh.grid": 128, "mesh.texture_size": 1024}  # fmt: skip
 DIFFERENCES = {
     "paper": {},
+    "paper-lgm": {"static.start.points": None, "static.start.kind": "lgm", "static.iterations": 0,
+                  "deformation.half_side": pytest.approx(1.6 * 4 / 3), "motion.length_scale": pytest.approx(4 / 3)},
     "video": {"subject.max_frames": 32, "motion.iterations": 500},
     "video-fast": {"subject.max_frames": 16, "motion.iterations": 500, "motion.views": 1},
     "release": {"static.t_max_start": 1.0, "static.t_max_end": 0.0,
@@ -178,6 +190,39 @@ def test_known_weights_with_the_wrong_cameras_are_refused(
     with pytest.raises(BadInput, match=rf"set {owner}\.variant={right}"):
         revise(PREVIEW, changes | {f"{owner}.variant": variant})
     revise(PREVIEW, changes | {f"{owner}.variant": right})
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "wrong"),
+    [
+        ("video-fast", {}, "motion.views = 1"),
+        ("preview", {"prior.memory_gb": 12}, "motion.views = 1"),
+        ("open", {}, "motion.views = 1"),
+        ("paper", {"static.views": 3}, "static.views = 3"),
+    ],
+)
+def test_views_that_form_no_rings_for_imagedream_are_refused(name: str, changes: dict[str, object], wrong: str) -> None:
+    changes = {"prior.kind": "imagedream", **changes}
+    with pytest.raises(BadInput, match=rf"{re.escape(wrong)} does not fit prior\.kind = imagedream.*multiple of 4"):
+        revise(profile(name), changes)
+    settings = revise(profile(name), {**changes, "static.views": 4, "motion.views": 8})
+    assert (settings.static.views, settings.motion.views) == (4, 8)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("paper", {}),
+        ("video-fast", {"motion.guidance_weight": 0}),
+        ("paper", {"static.views": 3, "static.iterations": 0}),
+    ],
+)
+def test_imagedream_takes_views_that_form_rings_or_are_not_scored(name: str, changes: dict[str, object]) -> None:
+    assert revise(profile(name), {"prior.kind": "imagedream", **changes}).prior.kind == "imagedream"
+
+
+def test_the_rings_of_imagedream_are_those_of_the_library() -> None:
+    assert IMAGEDREAM_RING == RING
 
 
 def test_the_scale_of_lgm_is_that_of_the_library() -> None:

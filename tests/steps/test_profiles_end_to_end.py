@@ -16,10 +16,10 @@ from tiny_svd import save_tiny_svd
 from tiny_wan import save_tiny_wan
 from tiny_weights import write_zero123
 
-from dg4d_lib.diffusion.view_drawing import ViewDrawer
+from dg4d_lib.diffusion.view_generation import ViewGenerator
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.weights.registry import KNOWN
-from steps.artifacts.packages import ABOUT, ASSET, MANIFEST, MERGED, MESHES, PLAYBACK, RIGGED, SPLATS
+from steps.artifacts.package_files import ABOUT, ASSET, MANIFEST, MERGED, MESHES, PLAYBACK, RIGGED, SPLATS
 from steps.catalog import STEPS
 from steps.contract import ArtifactRef, ProvenanceRecord, StepRequest, StepResult
 from steps.profiles import PROFILES, PipelineSettings, profile, revise, step_settings
@@ -135,7 +135,7 @@ class Run:
         surface = self.step("extract_mesh", {**cloud, "plan": self.step("plan_mesh", cloud)["plan"]})
         del surface["picture"]
         if self.settings.refiner.kind != "identity":
-            refined = self.step("refine_texture", {**surface, "driving_video": video})
+            refined = self.step("refine_texture", {**surface, "subject": subject, "driving_video": video})
             assert refined.keys() == surface.keys() and refined != surface
             surface = refined
         packed = self.step(
@@ -168,6 +168,12 @@ def source_of(folder: Path, store: ArtifactStore, moving: bool) -> ArtifactRef:
     ("name", "moving", "used"),
     [
         ("paper", False, {"drive_video": {"svd"}}),
+        pytest.param(
+            "paper-lgm",
+            False,
+            {"drive_video": {"svd"}, "fit_gaussians": {"zero123-xl", "imagedream", "lgm"}},
+            marks=pytest.mark.slow,
+        ),
         ("video", True, {}),
         ("video-fast", True, {}),
         ("release", False, {"drive_video": {"svd"}}),
@@ -197,7 +203,7 @@ def test_a_file_becomes_a_package_by_the_models_that_its_profile_names_and_no_ot
 
     said = run.notes()
     assert f"prior: Zero-1-to-3, weights {prior}" in said
-    assert any("LGM" in note for note in said) == (name == "reference")
+    assert any("LGM" in note for note in said) == (name in ("paper-lgm", "reference"))
     assert any("best of 4" in note for note in said) == (name == "quality")
     assert not [note for note in said if "no model" in note or "without a" in note]
 
@@ -219,8 +225,8 @@ def test_open_becomes_a_package_by_models_that_may_be_sold(tmp_path: Path, monke
     shrink_inputs(monkeypatch)
     subject = torch.ones(64, 64, 3)
     subject[16:48, 20:44] = torch.tensor([0.8, 0.2, 0.1])
-    draw = ViewDrawer.draw
-    monkeypatch.setattr(ViewDrawer, "draw", lambda self, *given: [subject for _ in draw(self, *given)])
+    generate = ViewGenerator.generate
+    monkeypatch.setattr(ViewGenerator, "generate", lambda self, *given: [subject for _ in generate(self, *given)])
     run = Run("open", ArtifactStore(tmp_path / "store"))
     with zipfile.ZipFile(run.make(source_of(tmp_path, run.store, moving=False))) as files:
         assert files.read(ASSET).startswith(b"glTF")

@@ -9,10 +9,11 @@ from tiny_svd import save_tiny_svd
 from tiny_weights import write_scheduler, write_zero123
 
 from dg4d_lib.errors import BadInput
+from dg4d_lib.images import over_white
 from dg4d_lib.mesh.textured import TexturedMesh, TrackedMesh
 from dg4d_lib.refiner_settings import IdentitySettings, ImageToImageSettings, RefinerSettings, VideoToVideoSettings
 from dg4d_lib.video.driving import DrivingVideo
-from steps.artifacts.media import write_frames
+from steps.artifacts.media import write_frames, write_png
 from steps.artifacts.meshes import read_meshes, read_tracked, write_meshes, write_tracked
 from steps.fitting import priors
 from steps.profiles import PREVIEW, step_settings
@@ -21,6 +22,8 @@ from steps.runtime.job import Job, StepReport
 
 FRAMES = 3
 TEXTURE = {"iterations": 2, "size": 64}
+SUBJECT = torch.tensor([0.0, 0.6, 0.2, 1.0]).repeat(48, 48, 1)  # another color and size than the video
+SUBJECT[:8, :, 3] = 0.0
 
 
 @pytest.fixture
@@ -37,13 +40,14 @@ def folder(tmp_path: Path) -> Path:
     )
     red = torch.tensor([0.9, 0.1, 0.1]).expand(FRAMES, 64, 64, 3)
     write_frames(tmp_path / "video", DrivingVideo(red, torch.ones(FRAMES, 64, 64, 1), 24.0))
+    write_png(tmp_path / "subject.png", SUBJECT)
     return tmp_path
 
 
 def refine(folder: Path, mode: str, refiner: RefinerSettings) -> StepReport:
     return run(
         Job(
-            inputs={mode: folder / f"{mode}.in", "driving_video": folder / "video"},
+            inputs={mode: folder / f"{mode}.in", "subject": folder / "subject.png", "driving_video": folder / "video"},
             outputs={"tracked": folder / "tracked", "meshes": folder / "meshes"},
             settings=step_settings("refine_texture", PREVIEW.model_copy(update={"refiner": refiner})),
             seed=0,
@@ -79,6 +83,20 @@ def test_video_diffusion_sees_all_frames_as_one_video(folder: Path, mode: str, m
         assert red > 0.53 and green < 0.47
     assert facts.backend == "cpu (diffusers)" and any("unet" in name for name in facts.weights) and facts.licenses
     assert "every 2 iterations" in facts.notes[0] and "2 steps" in facts.notes[0]
+
+
+def test_video_diffusion_is_conditioned_on_the_input_picture(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dg4d_lib.texture.refiner import VideoToVideo
+
+    seen: list[torch.Tensor] = []
+    init = VideoToVideo.__init__
+    monkeypatch.setattr(
+        VideoToVideo,
+        "__init__",
+        lambda self, kind, model, picture: seen.append(picture) or init(self, kind, model, picture),
+    )
+    refine(folder, "tracked", video_to_video(folder))
+    torch.testing.assert_close(seen[0].cpu(), over_white(SUBJECT), rtol=0, atol=0.5 / 255)
 
 
 def test_the_report_says_how_the_noise_was_annealed(folder: Path) -> None:

@@ -55,6 +55,7 @@ def score(
     package: Path | None = None,
     mesh: bool = False,
     actionbench: bool = False,
+    max_frames: int = 0,
     **knobs: object,
 ) -> tuple[dict, StepReport]:
     out.mkdir(parents=True, exist_ok=True)
@@ -65,7 +66,9 @@ def score(
     job = Job(
         inputs=inputs,
         outputs={"scores": out / "scores.json", "films": out / "films.zip"},
-        settings=ScoreAssetSettings(rasterizer="reference", mesh=mesh, actionbench=actionbench, score=settings),
+        settings=ScoreAssetSettings(
+            rasterizer="reference", mesh=mesh, actionbench=actionbench, max_frames=max_frames, score=settings
+        ),
         seed=0,
         progress=lambda done, total, values: None,
         pictures=out,
@@ -85,6 +88,20 @@ def test_an_asset_that_is_the_truth_is_perfect(package: Path, truth: Path, tmp_p
     spacing = 0.05  # of 2000 points on a gem of radius 0.3
     assert 0 < row["geometry"]["chamfer"] < spacing
     assert 0 < row["geometry"]["chamfer_aligned"] < spacing
+
+
+def test_a_video_that_was_sampled_is_scored_at_the_times_of_its_frames(
+    package: Path, truth: Path, tmp_path: Path
+) -> None:
+    whole = tmp_path / "truth"  # 6 frames, of which a video of 3 keeps 0, 2 and 4; at the end it stands
+    for name in ("view_0", "view_15"):
+        render_package(package, (float(name[5:]),), 0.0, SIZE, 6, False, whole, rasterizer="reference", last=4)
+    (whole / "view_0").rename(whole / "input")
+    assert (whole / "input/004.png").read_bytes() == (whole / "input/005.png").read_bytes()
+    sampled, _ = score(tmp_path / "a", whole, package, max_frames=3)
+    assert sampled["rows"]["asset"]["mean"]["psnr"] == pytest.approx(60)
+    stretched, _ = score(tmp_path / "b", whole, package)
+    assert stretched["rows"]["asset"]["mean"]["psnr"] < 40
 
 
 def test_a_mesh_elsewhere_is_far_until_it_is_aligned(package: Path, truth: Path, tmp_path: Path) -> None:

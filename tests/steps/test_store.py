@@ -1,6 +1,8 @@
 import errno
+import hashlib
 import os
 import shutil
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -130,6 +132,38 @@ def test_a_damaged_artifact_is_refused_and_dropped(store: ArtifactStore, tmp_pat
     assert not store.has(ref)
 
 
+def test_unchanged_files_are_read_once_also_after_equal_content_was_put(
+    store: ArtifactStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ref, reads, read = store.put_bytes(b"same", "a/b"), [], hashlib.file_digest
+
+    def counted(file: Any, algorithm: str) -> Any:
+        reads.append(file.name)
+        return read(file, algorithm)
+
+    monkeypatch.setattr(module.hashlib, "file_digest", counted)
+    kept = store.path(ref)
+    assert store.path(ref) == kept and store.is_sound(ref)
+    assert len(reads) == 1
+    os.utime(kept, (1, 1))
+    assert store.put_bytes(b"same", "a/b") == ref
+    assert len(reads) == 2  # since the time was another
+    assert store.path(ref).read_bytes() == b"same" and store.is_sound(ref)
+    assert len(reads) == 2
+
+
+@pytest.mark.parametrize(("read_s", "written_s", "stays"), [(0, 900, True), (900, 0, True), (900, 900, False)])
+def test_partial_files_go_when_they_were_neither_read_nor_written_for_a_while(
+    store: ArtifactStore, read_s: float, written_s: float, stays: bool
+) -> None:
+    store.write("incoming/new", "half")
+    partial = store.root / "incoming" / "new"
+    now = time.time()
+    os.utime(partial, (now - read_s, now - written_s))
+    store.tidy(600)
+    assert partial.exists() == stays
+
+
 def test_a_reference_to_nothing_is_missing(store: ArtifactStore) -> None:
     ref = ArtifactRef(digest="sha256:" + "0" * 64, media_type="a/b", size_bytes=1)
     assert not store.has(ref)
@@ -176,6 +210,9 @@ def test_home_is_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.delenv("DG4D_HOME")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "x"))
     assert home() == tmp_path / "x" / "dg4d"
+    monkeypatch.delenv("XDG_DATA_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert home() == tmp_path / ".local" / "share" / "dg4d"
 
 
 @pytest.mark.parametrize(

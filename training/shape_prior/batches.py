@@ -25,7 +25,7 @@ AHEAD = 6  # batches that are made before they are asked for, at least; with man
 
 @dataclass(frozen=True)
 class Batch:
-    """Pictures, and what lies on some of their rays.
+    """Pictures, with occupancy and colors along some of their rays.
 
     Attributes:
         picture: premultiplied color and alpha, 0 to 255.
@@ -72,8 +72,8 @@ def make_batch(seed: int, number: int, size: int, rays: int) -> Batch:
 
 def join_samples(samples: list[Sample], rays: int, generator: np.random.Generator) -> Batch:
     """Return samples as a batch, each with a random choice of its rays."""
-    chosen = [np.sort(generator.permutation(len(sample.pixels))[:rays]) for sample in samples]
-    pairs = list(zip(samples, chosen, strict=True))
+    selected = [np.sort(generator.permutation(len(sample.pixels))[:rays]) for sample in samples]
+    pairs = list(zip(samples, selected, strict=True))
     flat = np.concatenate([i * SIZE**2 + s.pixels[use].astype(np.int64) for i, (s, use) in enumerate(pairs)])
     counts = np.concatenate([s.counts[use] for s, use in pairs])
     depths = np.concatenate([s.depths[use] for s, use in pairs]).astype(np.float32) / 65535

@@ -4,9 +4,9 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from dg4d_lib.cameras.orbit import RADIUS
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.shape_prior.frustum import FAR, NEAR, TAN_HALF_FOV
 from training.shape_prior.solids import BOX, CARVE, CONE, CYLINDER, ELLIPSOID, PAINT, PLATE, TORUS, UNION
 from training.shape_prior.texture import (
@@ -30,7 +30,7 @@ OPTIONS = {"cache": True, "fastmath": {"nsz", "contract", "reassoc", "arcp"}, "e
 EMPTY = 1.0  # of the field where no solid is near
 MARGIN = 0.045  # world units around a solid in which its distance is known, at least
 MOST_SOLIDS = 128  # bits of the two words that say which solids are near a ray
-INTERVALS = 5  # of matter along a ray; what lies behind is joined to the last one
+INTERVALS = 5  # of matter along a ray; further ones are merged into the last
 
 
 @njit(**OPTIONS)
@@ -352,7 +352,7 @@ def _normal(kind, row, x, y, z):
 @njit(**OPTIONS)
 @no_type_check
 def _light(light, nx, ny, nz, x, y, z, first):
-    """Factor of the albedo, and what is added for gloss on surfaces that the camera sees."""
+    """Factor of the albedo, and the specular term of surfaces that the camera sees."""
     facing = light[0] * nx + light[1] * ny + light[2] * nz
     lit = max(facing, 0.0)
     if light[TOON] > 0:

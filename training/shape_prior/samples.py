@@ -146,7 +146,7 @@ class _Scene:
         return self.pose.inverse(max(float(np.abs(solid.outline_points()).max()) for solid in solids))
 
     def seen_from(self, azimuth_deg: float) -> "_Scene":
-        """Return the scene, with its light, turned so that the input camera sees what a camera at an azimuth sees."""
+        """Rotate the scene and its light so that the input camera shows the view from an azimuth."""
         turn = rotation(-math.radians(azimuth_deg))
         pose = Pose(turn @ self.pose.turn, self.pose.scale, turn @ self.pose.shift)
         return replace(self, pose=pose, light=np.concatenate([turn @ self.light[:3], self.light[3:]]))
@@ -297,7 +297,7 @@ def _picture(
     style = chance.pick(("render", "drawing", "rough"), (0.72, 0.13, 0.15))
     color, alpha = color.astype(np.float64), coverage.astype(np.float64)
     if style == "drawing":
-        color = _drawn(chance, color, alpha, depth, parts)
+        color = _as_drawing(chance, color, alpha, depth, parts)
     elif style == "rough":
         color = color + chance.generator.normal(0, chance.between(0, 0.06), color.shape)
         color = (color - 0.5) * chance.between(0.6, 1.2) + 0.5 + chance.normal(0.06)
@@ -313,11 +313,11 @@ def _picture(
     return (premultiplied * 255 + 0.5).astype(np.uint8)
 
 
-def _drawn(
+def _as_drawing(
     chance: Chance, color: Float64[np.ndarray, "s s 3"], alpha: Float64[np.ndarray, "s s"],
     depth: Float32[np.ndarray, "s s"], parts: np.ndarray,
 ) -> Float64[np.ndarray, "s s 3"]:  # fmt: skip
-    """Return the colors with dark lines along outlines and between parts, on paint or on bare paper."""
+    """Stylize the colors as a drawing: dark lines along outlines and between parts, painted or on bare paper."""
     inside = np.where(alpha > 0.4, depth, 9.0)
     reach = chance.pick((1, 1, 2))
     edge = np.zeros_like(alpha)

@@ -1,4 +1,4 @@
-"""Contact sheets of what the generator makes and of what the network predicts."""
+"""Contact sheets of synthetic shapes and of the network's predictions."""
 
 import argparse
 from collections.abc import Sequence

@@ -37,7 +37,7 @@ class Solid:
         axes: unit vectors of the local frame as rows.
         half: half sizes of the box around it, along `axes`.
         parameters: of the kind; see `Shape`.
-        blend: radius of the smooth union with what was there before; 0 is a hard edge.
+        blend: radius of the smooth union with earlier solids; 0 is a hard edge.
     """
 
     kind: int

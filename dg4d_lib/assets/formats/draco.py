@@ -45,7 +45,7 @@ class _Unpacked:
         self.meshes: dict[int, Any] = {}
 
     def add(self, primitive: dict[str, Any], packed: dict[str, Any]) -> None:
-        """Give a primitive its triangles and attributes; what several primitives share is decompressed once."""
+        """Give a primitive its triangles and attributes; data that several primitives share is decompressed once."""
         accessors, views, index = self.tree["accessors"], self.tree["bufferViews"], packed["bufferView"]
         if index not in self.meshes:
             self.meshes[index] = _decode(self.reader.view(index))

@@ -66,7 +66,7 @@ class ForeignGlb:
     Attributes:
         reader: its tree and buffer.
         pieces: its visible triangles.
-        notes: sentences about what is not used.
+        notes: sentences about content that is not used.
     """
 
     reader: GlbReader
@@ -95,18 +95,6 @@ def read_foreign_glb(content: bytes, max_faces: int) -> ForeignGlb:
         return _read(reader, max_faces)
     except (*_FOREIGN, RecursionError) as error:
         raise BadInput(f"the model is a broken glTF ({error!r}); export it again") from error
-
-
-def moved_pieces(glb: ForeignGlb) -> NDArray[np.float32]:
-    """Return the vertices of all pieces where the nodes of the file are now, in the coordinates of the model."""
-    globals_ = global_matrices(glb.reader.tree)
-    places = [
-        transform_points(
-            mesh_matrices(glb.reader, piece.node, piece.primitive, globals_), piece.local.astype(np.float64)
-        )
-        for piece in glb.pieces
-    ]
-    return np.concatenate(places).astype(np.float32)
 
 
 def _read(reader: GlbReader, max_faces: int) -> ForeignGlb:
@@ -164,7 +152,7 @@ def _pieces(reader: GlbReader, shown: Sequence[tuple[int, int]], globals_: Matri
 
 
 def _has_no_scale(node: dict[str, Any], matrix: NDArray[np.float64]) -> bool:
-    """Return whether a scale of 0 hides a mesh, as where frames are shown in turn; skinned ones follow joints alone."""
+    """Return whether a scale of 0 hides a mesh, as in flip-book animations; skinned meshes follow only joints."""
     return "skin" not in node and not matrix[:3, :3].any()
 
 

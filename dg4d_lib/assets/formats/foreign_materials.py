@@ -14,7 +14,7 @@ from dg4d_lib.mesh.models.model import REPEATED, Wrap, Wraps
 
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"  # materials of older exporters
 STRENGTH = "KHR_materials_emissive_strength"
-CUTOFF = 0.5  # alpha from which a masked material is opaque, where the file says nothing
+CUTOFF = 0.5  # default alpha cutoff of masked materials
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class BaseColors:
         self.pictures: dict[int, NDArray[np.uint8]] = {}
 
     def read(self, primitive: dict[str, Any]) -> BaseColor:
-        """Return the base color of a primitive; where that is black, the light that its material emits."""
+        """Return the base color of a primitive, or its emissive color if the base color is black."""
         attributes, material = primitive["attributes"], _material(self.reader.tree, primitive)
-        shading, emitted = _base_color(material), _emitted(material)
+        shading, emitted = _base_color(material), _emissive_factor(material)
         glows = any(emitted) and not any(shading.get("baseColorFactor", (1, 1, 1))[:3])
         info = material.get("emissiveTexture") if glows else shading.get("baseColorTexture")
         factor = emitted if glows else [float(value) for value in shading.get("baseColorFactor", (1, 1, 1, 1))]
@@ -122,14 +122,14 @@ def _base_color(material: dict[str, Any]) -> dict[str, Any]:
     return {renamed[key]: value for key, value in specular.items() if key in renamed}
 
 
-def _emitted(material: dict[str, Any]) -> list[float]:
-    """Return the factor of the light that a material emits, linear, at most 1."""
+def _emissive_factor(material: dict[str, Any]) -> list[float]:
+    """Return the emissive factor of a material, linear, at most 1."""
     strength = json_object(json_object(material.get("extensions")).get(STRENGTH)).get("emissiveStrength", 1)
     return [min(1.0, float(value) * float(strength)) for value in material.get("emissiveFactor", (0, 0, 0))]
 
 
 def _finite(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return float64 with 0 in place of NaN and infinity, which would spread to the colors of all that is near."""
+    """Convert to float64; replace NaN and infinity by 0, because interpolation would spread them."""
     return np.nan_to_num(values.astype(np.float64), posinf=0.0, neginf=0.0)
 
 

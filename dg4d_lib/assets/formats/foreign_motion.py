@@ -40,7 +40,7 @@ from dg4d_lib.assets.formats.tracks import Animation
 from dg4d_lib.mesh.models.model import Model
 from dg4d_lib.mesh.tracking.rig import continuous_quats
 
-SAMPLE = 2000  # vertices, evenly chosen, that the motion of a skeleton is fitted to
+SAMPLE = 2000  # evenly spaced vertices that the motion of a skeleton is fitted to
 PLACEMENT = "dg4d placement"
 MOTION = "dg4d motion"
 MOVES = "the model is animated by its skeleton; morph targets add what the skeleton cannot reproduce"
@@ -75,7 +75,7 @@ def write_moving_glb(
         BadInput: the file would be larger than a GLB may be.
     """
     notes = list(glb.notes)
-    document = _reopened(glb.reader, extras)
+    document = _editable_document(glb.reader, extras)
     tree = document.tree
     if tree.pop("animations", None):
         notes.append("the animations of the model were dropped: the new motion takes their place")
@@ -115,7 +115,7 @@ def write_moving_glb(
             }
             primitive["attributes"] = {**primitive["attributes"], **at_default}
             primitive["attributes"].pop("TANGENT", None)  # it would not turn with the normals
-            inverses = _inverses(glb, piece, skeleton, back)
+            inverses = _world_to_mesh(glb, piece, skeleton, back)
             turns = moving_normals and "NORMAL" in primitive["attributes"]
             poses = zip(keys, states, inverses, strict=False)
             primitive["targets"] = _targets(document, piece, poses, _smooth_normals(piece, states) if turns else None)
@@ -127,7 +127,7 @@ def write_moving_glb(
         animation.add_morph(node, str(tree["nodes"][node].get("name", f"node {node}")), keys, track, interpolation)
     animation.finish()
     tree["animations"][-1]["name"] = MOTION
-    _place(document, placement)
+    _place_scene(document, placement)
     _drop_unused_meshes(tree)
     return document.to_bytes(), tuple(notes)
 
@@ -179,7 +179,7 @@ def _animate_joints(
         animation.add_transform(joint, str(node.get("name", f"node {joint}")), keys, places, turns, interpolation)
 
 
-def _inverses(
+def _world_to_mesh(
     glb: ForeignGlb, piece: Piece, skeleton: SkeletonMotion | None, back: NDArray[np.float64]
 ) -> Iterable[NDArray[np.float64]]:
     """Return the world-to-mesh matrices of a piece, one per frame."""
@@ -232,7 +232,7 @@ def _targets(
     return targets
 
 
-def _place(document: GltfDocument, placement: NDArray[np.float64]) -> None:
+def _place_scene(document: GltfDocument, placement: NDArray[np.float64]) -> None:
     """Put the root nodes of the scene under a node that moves them into the world; other scenes are dropped.
 
     Skinned meshes stay roots, as glTF advises: they follow their joints alone. A node may be a root in another scene,
@@ -248,7 +248,7 @@ def _place(document: GltfDocument, placement: NDArray[np.float64]) -> None:
 
 
 def _follows_joints_alone(tree: dict[str, Any], node: int) -> bool:
-    """Return whether the place of a node has no effect: all it shows is skinned, and nothing hangs on it."""
+    """Return whether the transform of a node has no effect: its mesh is skinned, and it has no children."""
     item = tree["nodes"][node]
     if "mesh" not in item or item.get("children") or any(node in skin["joints"] for skin in tree.get("skins", ())):
         return False
@@ -264,8 +264,8 @@ def _drop_unused_meshes(tree: dict[str, Any]) -> None:
             node["mesh"] = used.index(node["mesh"])
 
 
-def _reopened(reader: GlbReader, extras: dict[str, Any]) -> GltfDocument:
-    """Return the file as a document that can be added to, without compression."""
+def _editable_document(reader: GlbReader, extras: dict[str, Any]) -> GltfDocument:
+    """Return the file as a document for further items, without compression."""
     document = GltfDocument({})
     tree = json.loads(json.dumps(reader.tree))
     views = []

@@ -11,7 +11,7 @@ from dg4d_lib.errors import BadInput
 
 MAX_NODES = 100_000
 MAX_DEPTH = 200  # of nested nodes
-MAX_GROUPS = 4  # of four joints per vertex
+MAX_GROUPS = 4  # largest number of joint groups per vertex, four joints each
 FLAT = 1e-9  # determinant of a matrix that cannot be inverted, relative to the cube of its norm
 
 Matrices = dict[int, NDArray[np.float64]]  # "4 4" per node

@@ -15,8 +15,8 @@ from dg4d_lib.mesh.tracking.articulation import Articulation, fit_rotations
 from dg4d_lib.mesh.tracking.rig import rigid_maps
 
 MOST_JOINTS = 256  # a body with hands has about 80; with 256, 32 frames take a minute
-ROUNDS = 6  # of the fit, of two Gauss-Newton steps each
-CARRIED = 0.1  # of the weights below a joint that count for the rotation it starts from
+ROUNDS = 6  # rounds of the fit, two Gauss-Newton steps each
+CARRIED = 0.1  # factor on the weights of descendants in the initial rotation of a joint
 UNEVEN = 1e-3  # largest deviation from a rotation of a node's matrix without its scale
 
 
@@ -105,7 +105,7 @@ class SkeletonMotion:
 
 
 def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[SkinnedVertices]) -> SkeletonMotion:
-    """Fit rotations of the joints, and the path of the whole, to moved vertices.
+    """Fit rotations of the joints, and the translation of the root, to moved vertices.
 
     Args:
         rest: global matrix of every node, parents before their children.
@@ -113,20 +113,20 @@ def fit_skeleton(rest: Matrices, parents: Mapping[int, int], skinned: Sequence[S
         skinned: the vertices, or some of them.
 
     Raises:
-        SkeletonAtRest: there are no or too many joints, or they would not show more of the motion than none.
+        SkeletonAtRest: there are no or too many joints, or they would not reproduce the motion better than no joints.
     """
     joints, movers, above = joints_and_movers(rest, parents, {joint for one in skinned for joint in one.joints})
     if len(joints) > MOST_JOINTS:
         raise SkeletonAtRest(f"it has {len(joints)} joints; at most {MOST_JOINTS} are animated")
-    weights = [_by_joint(one, movers, len(joints)) for one in skinned]
+    weights = [_weights_by_joint(one, movers, len(joints)) for one in skinned]
     if not any(one.any() for one in weights):
         raise SkeletonAtRest("it moves no vertex")
     start = np.concatenate([one.rest for one in skinned]).astype(np.float64)
     moved = np.concatenate([one.moved for one in skinned], 1).swapaxes(0, 1) - start[:, None]
     known = np.concatenate(weights).any(1)
-    still = _at_rest(np.stack([rest[joint][:3, 3] for joint in joints]), above, moved.shape[1])
-    padded = np.pad(np.concatenate(weights), ((0, 0), (1, 0)))  # none of the bone that all roots hang on
-    maps = _fitted(still, start[known], moved[known], padded[known])
+    still = _rest_articulation(np.stack([rest[joint][:3, 3] for joint in joints]), above, moved.shape[1])
+    padded = np.pad(np.concatenate(weights), ((0, 0), (1, 0)))  # the added root bone has no weights
+    maps = _fit_bones(still, start[known], moved[known], padded[known])
     if maps is None:
         raise SkeletonAtRest("it cannot reproduce the motion of the video")
     matrices = np.tile(np.eye(4), (*maps.shape[:2], 1, 1))
@@ -156,7 +156,7 @@ def joints_and_movers(
     return joints, movers, [movers.get(parents.get(joint, -1), -1) for joint in joints]
 
 
-def _fitted(
+def _fit_bones(
     skeleton: Articulation,
     rest: Float[np.ndarray, "n 3"],
     moved: Float[np.ndarray, "n t 3"],
@@ -180,7 +180,7 @@ def _fitted(
     return maps if np.square(moved - shown).sum() < np.square(moved).sum() else None
 
 
-def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int) -> Articulation:
+def _rest_articulation(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int) -> Articulation:
     """Return the joints as bones in the rest pose, after a root bone at their center that parents all root joints."""
     joints = np.concatenate([places.mean(0, keepdims=True), places])
     still = np.tile(np.eye(3), (len(joints), frames, 1, 1))
@@ -188,7 +188,7 @@ def _at_rest(places: Float[np.ndarray, "k 3"], above: Sequence[int], frames: int
     return Articulation(parents, joints, still, np.repeat(joints[:1], frames, 0))
 
 
-def _by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -> Float[np.ndarray, "v k"]:
+def _weights_by_joint(skinned: SkinnedVertices, movers: Mapping[int, int], count: int) -> Float[np.ndarray, "v k"]:
     """Return the weights of every vertex for all `count` joints."""
     columns = np.array([movers[joint] for joint in skinned.joints])
     dense = np.zeros((len(skinned.indices), count))

@@ -33,7 +33,7 @@ from dg4d_lib.geometry.spherical_harmonics import C0
 SPZ_HEADER = 16  # bytes, of the versions 2 and 3
 HIGHEST_DEGREE = 4  # of color in an SPZ
 MOST = 2_000_000  # splats that are read
-MIN_LOG_SCALE, MAX_LOGIT = -20.0, 20.0  # of splats; beyond these, they look the same
+MIN_LOG_SCALE, MAX_LOGIT = -20.0, 20.0  # limits of splats; larger values look the same
 CHUNK = 256  # splats of a compressed PLY that share bounds
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 HIGHER = "color of higher degrees was dropped: the splats keep their base color"

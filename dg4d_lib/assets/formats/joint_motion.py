@@ -9,7 +9,7 @@ from dg4d_lib.mesh.tracking.rig import Rig
 
 
 def bone_names(rig: Rig) -> list[str]:
-    """Return the names of all bones, numbered from the root; what a bone moves follows from the motion alone."""
+    """Return the names of all bones, numbered from the root; bones come from the motion and have no anatomy."""
     return [f"bone_{number:02d}" for number in range(1, len(rig.parents) + 1)]
 
 

@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 
-MOST_WORDS = 32  # of a texture's name
+MOST_WORDS = 32  # largest number of words in a texture's name
 _DRIVE = re.compile(r"^[A-Za-z]:/")
 
 
@@ -47,7 +47,7 @@ def library_names(statement: str) -> tuple[str, ...]:
     """Return the names that the MTL files of an OBJ may have: every word, and all as one name with spaces.
 
     Args:
-        statement: what follows `mtllib`.
+        statement: text after `mtllib`.
     """
     return tuple(dict.fromkeys((*statement.split(), statement)))
 
@@ -59,7 +59,7 @@ def texture_names(statement: str) -> tuple[str, ...]:
     can tell. Paths of another computer are of no use: the file is looked for beside the model.
 
     Args:
-        statement: what follows `map_Kd`.
+        statement: text after `map_Kd`.
     """
     words = statement.replace("\\", "/").replace("\t", " ").split(" ")[-MOST_WORDS:]
     tails = (" ".join(words[start:]).strip('"').removeprefix("./") for start in range(len(words)) if words[start])

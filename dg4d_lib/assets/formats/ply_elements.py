@@ -134,7 +134,7 @@ class _Numbers:
 
     def __init__(self, text: bytes) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # says that something is not a number
+            warnings.simplefilter("error", DeprecationWarning)  # reports text that is not a number
             try:
                 self.numbers = np.fromstring(text.decode("ascii", "replace"), np.float64, sep=" ")
             except DeprecationWarning as error:

@@ -36,7 +36,7 @@ def texture_file(content: bytes) -> str | None:
 
 
 def _too_many(count: int, most: int, what: str) -> str:
-    """Return what to do about too many faces or triangles."""
+    """Return the error message for too many faces or triangles."""
     return (
         f"the model has {count} {what}; asset.max_faces allows {most}: simplify it, or raise the limit with "
         f"--set asset.max_faces={count}"
@@ -87,10 +87,10 @@ def _part(elements: dict[str, Element], max_faces: int, texture: str | None, rea
     uvs = _uvs(vertex, face, indices, counts)
     picture = read_texture((texture,) if texture is not None and uvs is not None else (), read, decode, {})
     colors = None if picture is not None else _colors(vertex, face, indices, counts)
-    drawn = uvs if picture is not None else colors
-    rows = indices[:, None] if drawn is None else np.concatenate([indices[:, None], drawn], 1)
+    attributes = uvs if picture is not None else colors
+    rows = indices[:, None] if attributes is None else np.concatenate([indices[:, None], attributes], 1)
     unique, index = np.unique(rows, axis=0, return_inverse=True)
-    shade = 1.0 if drawn is not None else float(to_linear(np.array(GRAY)))
+    shade = 1.0 if attributes is not None else float(to_linear(np.array(GRAY)))
     return ModelPart(
         "model",
         points[unique[:, 0].astype(np.int64)],

@@ -22,12 +22,12 @@ from dg4d_lib.mesh.tracking.rig import Rig, fit_rig
 
 NAME = "subject"
 TARGET_ERROR = 0.05  # share of the motion; no bones are added below it, as the rest is hardly visible
-PRECISE = 0.004  # root mean square miss of a rig that can stand for the morph targets, world units of the fit
+PRECISE = 0.004  # largest root mean square error of a rig that replaces the morph targets, world units of the fit
 RIGID = 0.02  # change of a bone's length below which it counts as constant
 STILL = 1e-5  # change of a translation below which it gets no channel, relative to the largest coordinate
 MAX_BONES = 255  # joint indices are bytes
 FLOAT = 5126  # glTF component type
-WEIGHT_ONE, QUANTIZED_ONE = 65535, 255  # integer that stands for the weight 1
+WEIGHT_ONE, QUANTIZED_ONE = 65535, 255  # integer that encodes the weight 1
 
 
 def fit_asset_rig(

@@ -40,7 +40,7 @@ class Span:
     def poses(self) -> list[int]:
         """Frames shown at the keys that need a morph target, each once; frame 0 is the base, which needs none.
 
-        An animation of frame 0 alone has it as a pose that does not move, because glTF wants one morph target or more.
+        An animation of frame 0 alone keeps it as a zero morph target, because glTF requires at least one.
         """
         return [frame for frame in dict.fromkeys(key % self.total for key in self.keys) if frame > 0] or [0]
 

@@ -168,7 +168,7 @@ class UsdPlacement:
 
     @property
     def source(self) -> tuple[Path, float | None]:
-        """File and last key of what the scene stores, once for all placements that have them in common."""
+        """File and last key; placements that share both share the stored data."""
         return self.file, self.hold_s
 
 

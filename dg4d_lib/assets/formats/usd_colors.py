@@ -16,7 +16,7 @@ from dg4d_lib.mesh.models.model import REPEATED, Wrap, Wraps
 WHITE = (1.0, 1.0, 1.0)
 CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}  # of a picture, by the output of the texture
 WRAPS = {"mirror": Wrap.MIRROR, "clamp": Wrap.CLAMP, "black": Wrap.CLAMP}  # all others repeat
-MOST_TRANSFORMS = 8  # of texture coordinates, one after the other
+MOST_TRANSFORMS = 8  # largest number of chained transforms of texture coordinates
 Decode = Callable[[bytes, str], NDArray[np.uint8]]
 
 
@@ -73,7 +73,7 @@ class UsdMaterials:
         return self.colors[path]
 
     def note_gray(self, prim: Any) -> None:
-        """Note that what a prim's material shows was not read, if it has one."""
+        """Note that the material of a prim was not read, if it has one."""
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         if material:
             self.notes.append(

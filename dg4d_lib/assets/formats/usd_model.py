@@ -156,8 +156,8 @@ def _parts_by_material(
         corners = corners[:, ::-1]
     placed = (points @ matrix[:3, :3] + matrix[3, :3]) @ upright.T
     polygons = np.repeat(np.arange(len(counts)), (counts - 2).clip(0))  # of the triangles
-    for owner, chosen in _faces_by_material(mesh, len(counts), time):
-        triangles = corners[chosen[polygons]]
+    for owner, selected in _faces_by_material(mesh, len(counts), time):
+        triangles = corners[selected[polygons]]
         if not len(triangles):
             continue
         color = materials.read(owner)
@@ -192,10 +192,10 @@ def _faces_by_material(mesh: UsdGeom.Mesh, count: int, time: Any) -> Iterator[tu
     rest = np.ones(count, bool)
     for subset in UsdShade.MaterialBindingAPI(mesh.GetPrim()).GetMaterialBindSubsets():
         listed = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
-        chosen = np.zeros(count, bool)
-        chosen[listed[(listed >= 0) & (listed < count)]] = True
-        yield subset.GetPrim(), chosen & rest
-        rest &= ~chosen
+        selected = np.zeros(count, bool)
+        selected[listed[(listed >= 0) & (listed < count)]] = True
+        yield subset.GetPrim(), selected & rest
+        rest &= ~selected
     yield mesh.GetPrim(), rest
 
 

@@ -9,12 +9,12 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
 
 from dg4d_lib.errors import BadInput, FitDiverged
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.settings import MeshSettings
 
 LONGEST_SIDE = 1.8  # of the bounding box of the means, in the field's box [-1, 1]

@@ -19,7 +19,7 @@ from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.mesh.textured import TexturedMesh
 
 MODES = 8  # principal components of the motion
-MOTION_WEIGHT = 4.0  # of their root mean square over time, relative to the distance of surfaces at rest
+MOTION_WEIGHT = 4.0  # weight of the root mean square motion error, relative to the surface distance at rest
 NO_LIMIT = 1e9  # error bound that is never reached, so the number of triangles decides
 
 

@@ -22,18 +22,18 @@ from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh_rasterizer.zbuffer import rasterize_mesh
 
 SIZE = 1024  # pixels of the compared masks
-NEAR = 6.0  # pixels by which the outline of the surface may be wrong without a strand
-THICKEST = 8.0  # pixels from the middle of a strand to its side
-SHORTEST = 24.0  # pixels of a strand beyond the outline of the surface
-GAP = 8.0  # pixels of a strand that may be lost, where it is thinner than a pixel of the picture
-SLENDER = 4.0  # length of a strand, in its radii, at least
-MARGIN = 16  # pixels around what is not covered
+NEAR = 6.0  # pixels: tolerance of the surface's outline
+THICKEST = 8.0  # pixels: largest radius of a strand
+SHORTEST = 24.0  # pixels: least length of a strand beyond the outline of the surface
+GAP = 8.0  # pixels: largest gap in a strand, where it is thinner than a pixel of the picture
+SLENDER = 4.0  # least length of a strand, in its radii
+MARGIN = 16  # pixels around uncovered parts of the mask
 REACH = 48.0  # pixels from the root of a strand to the vertex that it grows out of
-ROUNDS = 4  # branches of a strand grow in the round after it
+ROUNDS = 4  # branches grow one round after their strand
 MOST = 16  # strands that are tried in a round, the longest ones: fringes of a cut-out are not legs
 SMOOTH = 4.0  # standard deviation of the middle line along its pixels
-THINNEST = 2.0  # pixels of radius
-TIP = 6  # pixels of the middle line that show where it goes on
+THINNEST = 2.0  # pixels: least radius
+TIP = 6  # pixels of the middle line from which it is extrapolated
 ATTEMPTS = 8  # vertices that a strand may grow out of
 CAMERA = OrbitCamera(width=SIZE, height=SIZE)
 

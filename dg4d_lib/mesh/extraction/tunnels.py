@@ -13,19 +13,16 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numba import njit
 from scipy import ndimage
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.kernels.compiling import configure_numba
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.mesh.extraction.density import DensityField
 from dg4d_lib.mesh.extraction.extract import surrounding_silhouettes
 from dg4d_lib.mesh.extraction.solid import ambiguous, cavities
 from dg4d_lib.mesh.shifts import shifted
 from dg4d_lib.rasterizer.interface import Rasterizer
-
-configure_numba()
 
 RADII = (1, 2, 3, 4)  # cells; tunnels narrower than twice the last are filled, the narrowest first
 INSIDE = 1.3  # density of filled samples, of the level: the surface over them lies between the samples
@@ -35,7 +32,7 @@ View = tuple[OrbitCamera, Bool[np.ndarray, "h w"]]  # with the silhouette that i
 
 
 def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, rasterize: Rasterizer) -> DensityField:
-    """Return the field with narrow tunnels filled, except those that some view looks through.
+    """Return the field with narrow tunnels filled, except those that are open in some view.
 
     A morphological closing (dilation by a ball, then erosion) gives the candidates; those that lower the genus are
     filled. So are cavities, which hide tunnels, and `ambiguous` samples, of which the interpolation makes handles.
@@ -74,7 +71,7 @@ def fill_tunnels(field: DensityField, level: float, gaussians: Gaussians, raster
 def _hidden_tunnels(
     solid: Bool[np.ndarray, "i j k"], origin: Float[np.ndarray, " 3"], cell: float, views: Sequence[View]
 ) -> Bool[np.ndarray, "i j k"]:
-    """Mark narrow tunnels that no view looks through."""
+    """Mark narrow tunnels that are covered in all views."""
     filled = solid.copy()
     for radius in RADII:
         candidates, _ = ndimage.label(_closed(filled, radius) & ~filled)

@@ -9,12 +9,12 @@ from scipy.sparse import csr_array
 from dg4d_lib.mesh.folds import DefectFinder
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, grown, neighbor_means
 
-ROUNDS = 24  # at most; smoothing also shrinks, which makes new defects in the end, so the best round counts
+ROUNDS = 24  # largest number; smoothing shrinks, which makes new defects in the end, so the best round is kept
 WIDER = 6  # rounds after which one more ring of neighbors is smoothed
 SWEEPS = 3  # averagings with the neighbors per round
 STEP = 0.5  # share of the way to the mean of the neighbors
-ATTEMPTS, RINGS = 20, 3  # at steps without new defects, and those after which more vertices around these move less
-SHORTER = 0.5  # factor of their steps in the first half of the attempts; then they go back entirely
+ATTEMPTS, RINGS = 20, 3  # attempts to avoid new defects, and attempts after which the affected region grows by a ring
+SHORTER = 0.5  # factor on steps near new defects in the first half of the attempts; later such steps are undone
 
 
 def unfold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
@@ -72,5 +72,5 @@ def without_new_defects(
         # later around old ones, too: a new one may cross a face that crossed others before
         around = grown(faces_to_vertices(new if early else present, faces, len(start)), edges, 1 + attempt // RINGS)
         share[around] *= SHORTER if early else 0
-        near = grown(around, edges, 1)[faces].any(1)  # what else is new is around, too; flips show one ring farther
+        near = grown(around, edges, 1)[faces].any(1)  # other new defects are nearby; flips show one ring farther
     return start.astype(np.float64)

@@ -21,15 +21,16 @@ from torch.nn import functional
 from dg4d_lib.mesh.neighbors import mesh_edges
 
 NEIGHBORS = 4  # nodes that move a point
+POINT_NEIGHBORS = 8  # nearest points to which a point without edges is joined
 BRIDGES = 6  # edges from a component to each component that it touches
 TOUCHING = 1.5  # factor on the smallest gap of a component: others within it are joined to it, too
 LINKS = 6  # nearest nodes of a node in the graph
 BRACES = 4  # edges of a node through the inside
-BRACE_REACH = 0.35  # of the diagonal: the longest of them
-PLACES = 7  # on such an edge, evenly, that must lie inside
-INWARD = 0.5  # cosine between such an edge and the normals at its ends
+BRACE_REACH = 0.35  # largest length of braces, share of the bounding box diagonal
+PLACES = 7  # evenly spaced points of a brace that must be inside the surface
+INWARD = 0.5  # least cosine between a brace and the inward normals at its ends
 SHORTEST = 1e-6  # world units: length of an edge between points at one place
-REACH = 6.0  # spacings of the nodes: farther points are not told apart
+REACH = 6.0  # node spacings: limit of the graph distances
 
 
 @dataclass(frozen=True)
@@ -117,23 +118,23 @@ def graph_of_points(points: Float[np.ndarray, "v 3"], graph: csr_array, count: i
         graph: symmetric matrix of the distances between neighboring points, connected.
         count: number of nodes; at most one per point.
     """
-    chosen, spacing = spread_nodes(graph, points, min(count, len(points)))
-    nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(chosen))
-    distances = graph_distances(graph, chosen, REACH * spacing).astype(np.float32)  # m v
+    selected, spacing = spread_nodes(graph, points, min(count, len(points)))
+    nearest = min(max(NEIGHBORS + 1, LINKS + 1), len(selected))
+    distances = graph_distances(graph, selected, REACH * spacing).astype(np.float32)  # m v
     distances = np.minimum(distances, REACH * spacing)
     order = np.argpartition(distances, nearest - 1, axis=0)[:nearest].T
     near = np.take_along_axis(distances.T, order, 1)
     rank = near.argsort(1, kind="stable")
     order, near = np.take_along_axis(order, rank, 1), np.take_along_axis(near, rank, 1)
-    used = min(NEIGHBORS, len(chosen))
+    used = min(NEIGHBORS, len(selected))
     reach = near[:, min(used, nearest - 1), None] if nearest > used else near[:, -1:] * 1.001 + 1e-9
     weights = np.square(1 - near[:, :used] / np.maximum(reach, 1e-9)).clip(1e-8)
     weights /= weights.sum(1, keepdims=True)
-    links = order[chosen, 1 : LINKS + 1]
-    pairs = np.stack([np.repeat(np.arange(len(chosen)), links.shape[1]), links.ravel()], 1)
+    links = order[selected, 1 : LINKS + 1]
+    pairs = np.stack([np.repeat(np.arange(len(selected)), links.shape[1]), links.ravel()], 1)
     pairs = np.unique(np.sort(pairs, 1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    nodes = points[chosen]
+    nodes = points[selected]
     lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1).clip(SHORTEST)
     return ControlGraph(
         torch.from_numpy(nodes.astype(np.float32)),
@@ -194,9 +195,9 @@ def surface_graph(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 
     return bridge_components(vertices, mesh_edges(faces))
 
 
-def point_graph(points: Float[np.ndarray, "v 3"], neighbors: int = 8) -> csr_array:
+def point_graph(points: Float[np.ndarray, "v 3"]) -> csr_array:
     """Return the distances of points to their nearest neighbors as a symmetric connected matrix, for splats."""
-    neighbors = min(neighbors, len(points) - 1)
+    neighbors = min(POINT_NEIGHBORS, len(points) - 1)
     index = np.asarray(cKDTree(points).query(points, k=neighbors + 1)[1])[:, 1:]
     pairs = np.stack([np.repeat(np.arange(len(points)), neighbors), index.ravel()], 1)
     return bridge_components(points, np.unique(np.sort(pairs, 1), axis=0))
@@ -215,15 +216,15 @@ def bridge_components(points: Float[np.ndarray, "v 3"], pairs: Int[np.ndarray, "
 
 def spread_nodes(graph: csr_array, points: Float[np.ndarray, "v 3"], count: int) -> tuple[Int[np.ndarray, " m"], float]:
     """Choose points along the graph, each the farthest from those before it; also return the largest gap left."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    nearest = graph_distances(graph, chosen[:1])[0]
-    while len(chosen) < count:
-        chosen.append(int(nearest.argmax()))
-        if nearest[chosen[-1]] == 0:
-            chosen.pop()
+    selected = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    nearest = graph_distances(graph, selected[:1])[0]
+    while len(selected) < count:
+        selected.append(int(nearest.argmax()))
+        if nearest[selected[-1]] == 0:
+            selected.pop()
             break
-        nearest = np.minimum(nearest, graph_distances(graph, chosen[-1:], float(nearest[chosen[-1]]))[0])
-    return np.array(chosen), max(float(nearest.max()), 1e-9)
+        nearest = np.minimum(nearest, graph_distances(graph, selected[-1:], float(nearest[selected[-1]]))[0])
+    return np.array(selected), max(float(nearest.max()), 1e-9)
 
 
 def graph_distances(
@@ -263,9 +264,9 @@ def _bridges(points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], pa
 
 
 def _nearest_elsewhere(
-    points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], chosen: Int[np.ndarray, " n"]
+    points: Float[np.ndarray, "v 3"], labels: Int[np.ndarray, " v"], selected: Int[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Return the nearest point with another label, and its distance, for chosen points; others have infinity.
+    """Return the nearest point with another label, and its distance, for selected points; infinity for others.
 
     Different labels differ in a bit, so two trees per bit are enough, whatever the number of labels.
     """
@@ -273,7 +274,7 @@ def _nearest_elsewhere(
     for bit in range(int(labels.max()).bit_length()):
         ones = (labels >> bit & 1).astype(bool)
         for outside in (np.flatnonzero(ones), np.flatnonzero(~ones)):
-            inside = chosen[ones[chosen] != ones[outside[0]]]
+            inside = selected[ones[selected] != ones[outside[0]]]
             tree = cKDTree(points[outside], compact_nodes=False, balanced_tree=False)  # faster far from points
             found, index = map(np.asarray, tree.query(points[inside]))
             closer = found < distances[inside]

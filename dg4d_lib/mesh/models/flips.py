@@ -1,4 +1,4 @@
-"""Repair of faces that a motion turns inside out."""
+"""Repair of faces that a motion flips."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -7,9 +7,9 @@ from scipy.sparse import csr_array
 from dg4d_lib.mesh.folds import area_normals
 from dg4d_lib.mesh.neighbors import edge_graph, faces_to_vertices, graph_laplacian, grown, screened_factors
 
-RINGS = (2, 4, 8, 16, 32, 64, 128)  # of vertices around flipped faces that give way, one attempt after the other
-NEAR, SLIVER = 8, 0.1  # rings beyond which nothing gives way for flipped slivers, of less than so many median areas
-SHORTEST = 1e-3  # of the median length: no edge is stiffer than one so short
+RINGS = (2, 4, 8, 16, 32, 64, 128)  # relaxed rings of vertices around flipped faces, one attempt each
+NEAR, SLIVER = 8, 0.1  # largest relaxed region, rings, for flipped slivers below this area, relative to the median
+SHORTEST = 1e-3  # edge length at which the stiffness is clamped, relative to the median
 LEAST_OWN = 1e-6  # weight of the own motion of vertices at flipped faces, against 1 per edge
 
 

@@ -54,7 +54,7 @@ class ModelPart:
         colors: linear color per vertex; None for white.
         masked: True if the alpha of the texture cuts holes.
         wrap: wrap modes of the texture outside [0, 1].
-        normals: unit normals at rest, which tell hard edges from smooth ones; None where all are smooth.
+        normals: unit normals at rest, which distinguish hard and smooth edges; None if all are smooth.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Model:
 
     Attributes:
         parts: meshes; at least one with triangles.
-        notes: sentences about what is not used or was changed.
+        notes: sentences about content that is not used or was changed.
     """
 
     parts: tuple[ModelPart, ...]
@@ -123,8 +123,8 @@ class Model:
         colors, alpha = np.zeros((len(faces), 3), np.float32), np.zeros(len(faces), np.int64)
         start = 0
         for part in self.parts:
-            chosen = (faces >= start) & (faces < start + len(part.faces))
-            colors[chosen], alpha[chosen] = part.sample(faces[chosen] - start, barycentrics[chosen])
+            selected = (faces >= start) & (faces < start + len(part.faces))
+            colors[selected], alpha[selected] = part.sample(faces[selected] - start, barycentrics[selected])
             start += len(part.faces)
         return colors, alpha
 

@@ -4,11 +4,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 MOST_CORNERS = 1024  # of a polygon whose ears are cut; larger ones become fans, since the time grows with the square
 EMPTY = 1e-6  # area of a triangle, as a share of the polygon's, up to which its orientation does not count
@@ -39,10 +36,10 @@ def triangulate(
         step = max(1, CHUNK // int(count))
         for some in (same[start : start + step] for start in range(0, len(same), step)):
             flat, folded = _flattened(points[indices[corners[some, None] + np.arange(count)]])
-            chosen = some[folded]
-            if len(chosen):
-                rows = first[chosen, None] + np.arange(count - 2)
-                found[rows] = corners[chosen, None, None] + _cut_ears(flat[folded])
+            selected = some[folded]
+            if len(selected):
+                rows = first[selected, None] + np.arange(count - 2)
+                found[rows] = corners[selected, None, None] + _cut_ears(flat[folded])
     return found
 
 
@@ -81,7 +78,7 @@ def _cut_ears(polygons):
         for k in range(count):
             before[k], after[k] = (k - 1) % count, (k + 1) % count
         for k in range(count):
-            areas[k], ears[k] = _look(corners, before, after, k)
+            areas[k], ears[k] = _test_ear(corners, before, after, k)
         start = 0
         for triangle in range(count - 2):
             tip = k = start
@@ -96,14 +93,14 @@ def _cut_ears(polygons):
             found[number, triangle] = first, tip, last
             after[first], before[last] = last, first
             for k in (first, last):
-                areas[k], ears[k] = _look(corners, before, after, k)
+                areas[k], ears[k] = _test_ear(corners, before, after, k)
             start = last
     return found
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _look(corners, before, after, tip):
+def _test_ear(corners, before, after, tip):
     """Return the area of the triangle at a corner, and whether it is an ear: no other corner is in it.
 
     Corners at the same place as one of the three do not count: holes are cut in with them.

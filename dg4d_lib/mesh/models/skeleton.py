@@ -13,7 +13,7 @@ from dg4d_lib.mesh.models.surface_cloud import SurfaceCloud
 
 INFLUENCES = 8  # joints that move a point, the heaviest ones
 SOME = 1e-6  # share of all weights from which a joint turns for itself
-ROWS = 8192  # of the weights that are dense at once
+ROWS = 8192  # rows of weights per dense batch
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Skeleton:
 
     Attributes:
         places: joints in the coordinates of the model.
-        parents: joint that each hangs on, which comes before it; -1 for none.
+        parents: parent of every joint, which comes before it; -1 for none.
         weights: of the joints at the vertices of the model, sparse; rows sum to 1, or to 0 where no joint moves them.
     """
 
@@ -33,12 +33,12 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class JointGraph:
-    """Joints as control nodes: the first one, at their center, carries what no joint moves, and all roots.
+    """Joints as control nodes: the first node, at their center, is the parent of all roots and moves all other points.
 
     Attributes:
         graph: nodes, the points that they move, and the edges from joints to their parents.
-        parents: node that each hangs on, which comes before it; -1 for the first one.
-        turning: nodes that turn; the others follow their parents, as joints do that only help to pose a model.
+        parents: parent of every node, which comes before it; -1 for the first one.
+        turning: nodes that rotate; the others, such as helper joints, follow their parents.
     """
 
     graph: ControlGraph
@@ -86,16 +86,16 @@ def _at_fine_vertices(weights: csr_array, surface: SurfaceCloud, faces: Int[np.n
 
 
 def _heaviest(weights: csr_array) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
-    """Return the nodes that move every point, and their weights; 0 is the first node, which moves what is left."""
+    """Return the nodes that move every point, and their weights; node 0 takes the remaining weight."""
     count = min(INFLUENCES, weights.shape[1])
     indices, shares = [], []
     for start in range(0, weights.shape[0], ROWS):
         dense = weights[start : start + ROWS].toarray()
-        chosen = np.argpartition(-dense, count - 1, axis=1)[:, :count]
-        share = np.take_along_axis(dense, chosen, 1)
+        selected = np.argpartition(-dense, count - 1, axis=1)[:, :count]
+        share = np.take_along_axis(dense, selected, 1)
         total = share.sum(1, keepdims=True)
         free = total[:, 0] < SOME
-        nodes, share = chosen + 1, share / np.where(total < SOME, 1, total)
+        nodes, share = selected + 1, share / np.where(total < SOME, 1, total)
         nodes[free, 0], share[free] = 0, np.eye(count)[0]  # all nodes of a point differ, as a graph needs it
         indices.append(nodes)
         shares.append(share)

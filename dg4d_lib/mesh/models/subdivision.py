@@ -11,7 +11,7 @@ _CORNERS = np.eye(3)
 
 @dataclass(frozen=True)
 class FineMesh:
-    """Subdivided mesh whose faces know their place in the original ones.
+    """Subdivided mesh, with the original face and barycentrics of every face.
 
     Attributes:
         vertices: the original vertices first, then edge midpoints.
@@ -77,8 +77,8 @@ def _split(
     }
     parts = []
     for number, triangles in forms.items():
-        chosen = count == number
+        selected = count == number
         for triangle in triangles:
-            parts.append((points[chosen][:, triangle], sources[chosen], places[chosen][:, triangle]))
+            parts.append((points[selected][:, triangle], sources[selected], places[selected][:, triangle]))
     new_faces, new_sources, new_places = (np.concatenate(values) for values in zip(*parts, strict=True))
     return new_faces, new_sources, new_places

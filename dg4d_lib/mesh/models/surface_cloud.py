@@ -17,8 +17,8 @@ from dg4d_lib.mesh.extraction.topology import group_vertices
 from dg4d_lib.mesh.models.model import OPAQUE, TRANSPARENT, Model
 from dg4d_lib.mesh.models.subdivision import FineMesh, subdivide
 
-WELD = 1e-5  # of the model's size: vertices closer than this are one
-EDGE = 0.03  # of the model's size: longest edge of the subdivided surface
+WELD = 1e-5  # vertices closer than this are merged, share of the model's size
+EDGE = 0.03  # longest edge of the subdivided surface, share of the model's size
 MAX_VERTICES = 20000  # of the subdivided surface
 OPACITY = 0.95  # at the center of a Gaussian
 SPREAD = 0.45  # standard deviation, times the root of the area per Gaussian: outlines neither grow nor get holes
@@ -72,26 +72,28 @@ def cover_surface(model: Model, count: int, generator: torch.Generator) -> Surfa
     if not size or not 0 < ends[-1] < math.inf:
         raise BadInput("the triangles of the model have no area; export it again")
     along, u, v = torch.rand(3, count, generator=generator, dtype=torch.float64).numpy()
-    chosen = np.searchsorted(ends, (np.arange(count) + along) / count * ends[-1], side="right").clip(max=len(ends) - 1)
+    selected = np.searchsorted(ends, (np.arange(count) + along) / count * ends[-1], side="right").clip(
+        max=len(ends) - 1
+    )
     root = np.sqrt(u)
     weights = np.stack([1 - root, root * (1 - v), root * v], 1)
-    places = np.einsum("nk,nkc->nc", weights, fine.barycentrics[chosen])
-    colors, alpha = model.sample(fine.sources[chosen], places)
+    places = np.einsum("nk,nkc->nc", weights, fine.barycentrics[selected])
+    colors, alpha = model.sample(fine.sources[selected], places)
     kept = alpha >= OPAQUE
     if not kept.any():
         raise BadInput(TRANSPARENT)
-    chosen, weights, colors = chosen[kept], weights[kept], colors[kept]
-    means = np.einsum("nk,nkc->nc", weights, corners[chosen])
+    selected, weights, colors = selected[kept], weights[kept], colors[kept]
+    means = np.einsum("nk,nkc->nc", weights, corners[selected])
     scale = SPREAD * math.sqrt(0.5 * ends[-1] / count)
     log_scales = torch.tensor([scale, scale, FLATNESS * scale]).log().expand(len(means), 3).clone()
     cloud = Gaussians(
         torch.from_numpy(means.astype(np.float32)),
         log_scales,
-        _facing(torch.from_numpy(normals[chosen] / areas[chosen, None])),
+        _facing(torch.from_numpy(normals[selected] / areas[selected, None])),
         torch.full((len(means),), math.log(OPACITY / (1 - OPACITY))),
         rgb_to_sh(torch.from_numpy(colors)),
     )
-    nearest = np.take_along_axis(fine.faces[chosen], weights.argmax(1)[:, None], 1)[:, 0]
+    nearest = np.take_along_axis(fine.faces[selected], weights.argmax(1)[:, None], 1)[:, 0]
     return SurfaceCloud(fine, welded, cloud, torch.from_numpy(nearest))
 
 

@@ -11,10 +11,10 @@ from dg4d_lib.mesh.models.model import OPAQUE, ModelPart, to_linear, to_srgb
 
 MOST_REPEATS = 4  # repetitions of a texture in its tile, per side
 CLAMPED = (-1.0, 2.0)  # texture coordinates around a clamped texture in its tile, per side
-GUTTER = 4  # texels of a tile around what its triangles show
+GUTTER = 4  # texels of a tile around the region that its triangles show
 SMALLEST_TILE = 2 * GUTTER + 2 * MOST_REPEATS  # texels per side
 MOST_BLOCKS = 256  # per side of a texture, of texels that are searched for opaque ones together
-SLACK = 1e-3  # of a repetition, which rounding may exceed
+SLACK = 1e-3  # rounding tolerance, share of a repetition
 
 
 def split_by_tile(part: ModelPart) -> list[ModelPart]:

@@ -17,7 +17,6 @@ import numpy as np
 import OpenImageIO as oiio
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -27,6 +26,7 @@ from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.cameras.viewpoints import baking_views
 from dg4d_lib.errors import DG4DError
 from dg4d_lib.gaussians.cloud import Gaussians
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import ALPHA_THRESHOLD
 from dg4d_lib.mesh.shifts import shifted
@@ -38,7 +38,7 @@ from dg4d_lib.settings import MeshSettings
 SHARPNESS = 2  # exponent of a view's weight in cosine above the minimum and reliable share; views blend without seams
 INPUT_WEIGHT = 200.0  # weight of the input view relative to others; only its colors come from a photograph
 MIN_COSINE = 0.5  # texels seen at a more oblique angle are not colored
-INPUT_MIN_COSINE = 0.6 * MIN_COSINE  # likewise in the input view: a stretched true color beats a guessed one
+INPUT_MIN_COSINE = 0.6 * MIN_COSINE  # the same in the input view: a stretched true color is better than a predicted one
 INSIDE = 2  # grade of a pixel inside a silhouette; 1 along it, 0 outside
 OUTLINE = 2  # width of the unreliable band along silhouettes and occluding edges, pixels
 LAST_RESORT = 1e-4  # weight of oblique views and of the unreliable band, used only where no better view exists
@@ -60,7 +60,7 @@ GradedPictures = tuple[
 
 @dataclass(frozen=True)
 class PosedSurface:
-    """Surface at one frame of the driving video, and what the input view shows of it.
+    """Surface at one frame of the driving video, and its picture from the input view.
 
     Attributes:
         vertices: world units, split along the seams.
@@ -119,14 +119,14 @@ def bake_texture(
     settings: MeshSettings,
     footage: Sequence[PosedSurface] = (),
 ) -> Float[Tensor, "h w 3"]:
-    """Bake the texture of a mesh from renders of what it was extracted from, and from footage that it follows.
+    """Bake the texture of a mesh from renders of the subject, and from the frames that the mesh follows.
 
     Args:
         vertices: world units, split along the seams.
         normals: of the unsplit surface (`dg4d_lib.geometry.normals.vertex_normals`), one per split vertex.
         faces: counter-clockwise seen from outside.
         uvs: texture coordinates in [0, 1], v down.
-        draw: renders the Gaussians (`drawn_gaussians`), or another guess of the subject.
+        draw: renders the Gaussians (`gaussian_renderer`), or another guess of the subject.
         settings: mesh settings.
         footage: the surface at frames of the driving video. They are averaged, and take the place of the renders in
             the input view.
@@ -259,7 +259,7 @@ def _add(
         _gather(positions, normals, *pose, *images, *rule, total[part])
 
 
-def drawn_gaussians(gaussians: Gaussians, rasterize: Rasterizer) -> Draw:
+def gaussian_renderer(gaussians: Gaussians, rasterize: Rasterizer) -> Draw:
     """Return a function that renders one state of a cloud."""
 
     def draw(cameras: Sequence[OrbitCamera]) -> Pictures:
@@ -278,7 +278,7 @@ def grade_pixels(
     faces: Int[Tensor, "f 3"],
     reach: int,
 ) -> GradedPictures:
-    """Tell which pixels of pictures lie inside the subject, and how deep the mesh is there.
+    """Grade the pixels of pictures by their distance from the silhouette, and add the depth of the mesh.
 
     Args:
         color: straight, in [0, 1].

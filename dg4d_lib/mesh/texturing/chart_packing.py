@@ -10,8 +10,9 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from numpy.typing import NDArray
+
+from dg4d_lib.kernels.compiling import njit
 
 FINEST = 512  # cells per side of the grid of places, at most
 GAP = 2  # texels between charts, at least

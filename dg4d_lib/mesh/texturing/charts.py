@@ -11,11 +11,11 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.mesh.neighbors import half_edges, twin_half_edges
 from dg4d_lib.mesh.texturing.flatten import flat_areas, flatten, overlapping
 
@@ -113,7 +113,7 @@ def _merged(surface: "_Surface", labels: Labels, limits: Limits, least: int) -> 
             if passed[first]:
                 labels = np.where(
                     merged == first, fresh, labels
-                )  # a new name: what was refused to its parts is not to it
+                )  # new label: merges that were refused for its parts may be tried again
                 fresh += 1
             else:
                 refused.add((first, second))
@@ -161,40 +161,40 @@ class _Surface:
         graph = coo_array((np.ones(kept.shape[1]), tuple(kept)), shape=(len(labels), len(labels)))
         return connected_components(graph, directed=False)[1].astype(np.int64)
 
-    def cut(self, labels: Labels, chosen: Bool[np.ndarray, " f"]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Split the vertices of chosen faces along the borders of charts; return sources and faces."""
+    def cut(self, labels: Labels, selected: Bool[np.ndarray, " f"]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Split the vertices of selected faces along the borders of charts; return sources and faces."""
         sides = self.pairs // 3
-        kept = self.pairs[(labels[sides[:, 0]] == labels[sides[:, 1]]) & chosen[sides[:, 0]] & chosen[sides[:, 1]]]
+        kept = self.pairs[(labels[sides[:, 0]] == labels[sides[:, 1]]) & selected[sides[:, 0]] & selected[sides[:, 1]]]
         ahead = kept // 3 * 3 + (kept % 3 + 1) % 3
         joined = np.concatenate([np.stack([kept[:, 0], ahead[:, 1]]), np.stack([ahead[:, 0], kept[:, 1]])], 1)
         count = 3 * len(self.faces)
         graph = coo_array((np.ones(joined.shape[1]), tuple(joined)), shape=(count, count))
-        corners = connected_components(graph, directed=False)[1].reshape(-1, 3)[chosen]
+        corners = connected_components(graph, directed=False)[1].reshape(-1, 3)[selected]
         _, first, faces = np.unique(corners, return_index=True, return_inverse=True)
-        return self.faces[chosen].ravel()[first], faces.reshape(-1, 3)
+        return self.faces[selected].ravel()[first], faces.reshape(-1, 3)
 
-    def passes(self, labels: Labels, chosen: Bool[np.ndarray, " f"], limits: Limits) -> Bool[np.ndarray, " c"]:
-        """Test the charts of chosen faces: disks, without overlap, of even density and compact."""
+    def passes(self, labels: Labels, selected: Bool[np.ndarray, " f"], limits: Limits) -> Bool[np.ndarray, " c"]:
+        """Test the charts of selected faces: disks, without overlap, of even density and compact."""
         count = int(labels.max()) + 1
         single = np.bincount(labels) == 1
         small = np.bincount(labels, self.areas) <= limits.largest * self.areas.sum()
-        chosen = chosen & (small | single)[labels]
-        if not chosen.any():
+        selected = selected & (small | single)[labels]
+        if not selected.any():
             return np.zeros(count, bool)
-        _, faces = self.cut(labels, chosen)
-        names = labels[chosen]
+        _, faces = self.cut(labels, selected)
+        names = labels[selected]
         owner = np.zeros(faces.max() + 1, np.int64)
         owner[faces] = names[:, None]
         sides = self.pairs // 3
-        inner = chosen[sides[:, 0]] & (labels[sides[:, 0]] == labels[sides[:, 1]])
+        inner = selected[sides[:, 0]] & (labels[sides[:, 0]] == labels[sides[:, 1]])
         euler = np.bincount(owner, minlength=count) + np.bincount(labels[sides[inner, 0]], minlength=count)
         euler -= 2 * np.bincount(names, minlength=count)  # vertices - edges + faces, with 3 half edges per face
         passed = euler == 1
         if not passed.any():
             return passed
-        charts = self.flattened(labels, chosen & passed[labels])
+        charts = self.flattened(labels, selected & passed[labels])
         names = charts.labels
-        densities = self.densities(charts, chosen & passed[labels])
+        densities = self.densities(charts, selected & passed[labels])
         shares = [
             np.bincount(names, densities[1] * beyond, count)
             / np.maximum(np.bincount(names, densities[1], count), 1e-30)
@@ -204,28 +204,28 @@ class _Surface:
         even = ~flipped & (shares[0] <= limits.outside) & (shares[1] <= limits.outside)
         return passed & (single | (even & ~overlapping(charts.flat, charts.faces, names, count)))
 
-    def densities(self, charts: Charts, chosen: Bool[np.ndarray, " f"]) -> tuple[Array, Array]:
-        """Return the linear texel density of chosen faces relative to the mean of their chart, and their areas."""
-        corners = self.vertices[self.faces[chosen]]
+    def densities(self, charts: Charts, selected: Bool[np.ndarray, " f"]) -> tuple[Array, Array]:
+        """Return the linear texel density of selected faces relative to the mean of their chart, and their areas."""
+        corners = self.vertices[self.faces[selected]]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         flat = flat_areas(charts.flat, charts.faces).clip(0)  # negative where a face is mirrored
         return np.sqrt(flat / np.maximum(areas, np.finfo(float).tiny)), areas
 
-    def flattened(self, labels: Labels, chosen: Bool[np.ndarray, " f"] | None = None) -> Charts:
-        """Flatten the charts of chosen faces, which must be disks."""
-        chosen = np.ones(len(labels), bool) if chosen is None else chosen
-        if self._latest is not None and chosen.all() and np.array_equal(labels, self._latest.labels):
+    def flattened(self, labels: Labels, selected: Bool[np.ndarray, " f"] | None = None) -> Charts:
+        """Flatten the charts of selected faces, which must be disks."""
+        selected = np.ones(len(labels), bool) if selected is None else selected
+        if self._latest is not None and selected.all() and np.array_equal(labels, self._latest.labels):
             return self._latest
-        sources, faces = self.cut(labels, chosen)
-        names, disk = np.unique(labels[chosen], return_inverse=True)
+        sources, faces = self.cut(labels, selected)
+        names, disk = np.unique(labels[selected], return_inverse=True)
         flat = flatten(self.vertices[sources], faces, disk.ravel(), len(names))
-        charts = Charts(labels[chosen], sources, faces, flat)
-        self._latest = charts if chosen.all() else self._latest
+        charts = Charts(labels[selected], sources, faces, flat)
+        self._latest = charts if selected.all() else self._latest
         return charts
 
-    def split(self, labels: Labels, chosen: Bool[np.ndarray, " f"]) -> Labels:
-        """Split the charts of chosen faces in two by their normals."""
-        names = np.unique(labels[chosen])
+    def split(self, labels: Labels, selected: Bool[np.ndarray, " f"]) -> Labels:
+        """Split the charts of selected faces in two by their normals."""
+        names = np.unique(labels[selected])
         if len(names) == 0:
             return labels
         members = [np.flatnonzero(labels == name) for name in names]

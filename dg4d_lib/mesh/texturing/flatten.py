@@ -10,11 +10,11 @@ from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.mesh.neighbors import edge_graph, edge_keys, half_edges
 
 ROTATIONS = 10  # alternations between rotations and vertices; ten more lower the spread of texel density by 1 to 5 %
@@ -54,10 +54,10 @@ def flatten(
     flipped = np.zeros(count, bool)
     flipped[disk[flat_areas(flat, faces) <= 0]] = True
     if flipped.any():
-        chosen = flipped[disk]
-        kept, local = np.unique(faces[chosen], return_inverse=True)
-        names = np.cumsum(flipped)[disk[chosen]] - 1
-        flat[kept] = _injective(circles[kept], local.reshape(-1, 3), corners[chosen], names, int(flipped.sum()))
+        selected = flipped[disk]
+        kept, local = np.unique(faces[selected], return_inverse=True)
+        names = np.cumsum(flipped)[disk[selected]] - 1
+        flat[kept] = _injective(circles[kept], local.reshape(-1, 3), corners[selected], names, int(flipped.sum()))
     scale = np.sqrt(sizes / np.maximum(np.bincount(disk, flat_areas(flat, faces), count), np.finfo(float).tiny))
     return flat * scale[of_vertex][:, None]
 

@@ -80,12 +80,12 @@ def fit_texture(mesh: TexturedMesh, footage: Sequence[PosedSurface]) -> Texture:
 
 
 def _best_change(start: Texture, inside: Bool[Tensor, "h w"], frames: _Pixels) -> Texture:
-    """Return what to add to a texture, whose texels inside of charts are given."""
+    """Return the change of a texture that fits the frames best, given its texels inside of charts."""
     variable = start.clone().requires_grad_()
     seen = frames.render(variable)
 
     def spread(errors: Float[Tensor, "p 3"]) -> Texture:
-        """Return what every texel contributes to weighted errors: the transpose of the renders, which are linear."""
+        """Apply the transpose of the renders, which are linear, to weighted errors."""
         (gradient,) = torch.autograd.grad(seen, variable, frames.weights * errors, retain_graph=True)
         return gradient
 

@@ -37,13 +37,13 @@ from dg4d_lib.shape_prior.mirror import MirrorPlane
 REACH = 0.12  # world units along a ray of the input camera: a mirror image further from the surface shows nothing
 LEAST_AGREEMENT = 0.5  # cosine between the normals of mirror image and surface; below it, it is another part's surface
 SHOWN = 1 / LAST_RESORT  # weight of colors that frames show: a frame that shows them beside its outline counts, too
-GUESSED = 0.01  # weight of other colors; mirror images that are seen at grazing angles give way to them
+GUESSED = 0.01  # weight of other colors; mirror images seen at grazing angles have less
 
 
 def mirror_texture(
     mesh: TexturedMesh, footage: Sequence[PosedSurface], plane: MirrorPlane
 ) -> tuple[Float[Tensor, "h w 3"], float]:
-    """Color what no frame shows by the mirror image of what the input view shows.
+    """Color texels that no frame shows by the mirror image of the surface in the input view.
 
     Args:
         mesh: with the texture to change.

@@ -62,7 +62,7 @@ def fit_joints(skeleton: Articulation, rest: Array, moved: Array, weights: Array
         rest: vertices "n 3".
         moved: their displacements at every frame "n t 3".
         weights: skinning weights "n k".
-        start: joints "k 3" that the fit stays near to where the motion says little.
+        start: joints "k 3" that regularize the fit where the motion does not determine it.
     """
     count, frames = skeleton.rotations.shape[:2]
     total = skeleton.below(weights)

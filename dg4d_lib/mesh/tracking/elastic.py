@@ -13,11 +13,11 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
-from numba import njit
 from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
 from dg4d_lib.geometry.rotation import nearest_rotation
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 from dg4d_lib.mesh.extraction.silhouettes import silhouette_iou
 from dg4d_lib.mesh.folds import DefectFinder
@@ -38,7 +38,7 @@ PULL = 1.0  # weight of the tracked position of a vertex, against 1 for each of 
 PASSES = 5  # alternations of rotations and positions
 NEARBY = (1, 2, 3, 4, 6)  # rings of vertices around flipped faces that are relaxed, in one attempt each
 LOOSE, LONG = 1e-3, 20  # pull and alternations of these
-MAX_LOSS = 0.003  # of the silhouette IoU that the stronger relaxation of a frame may cost
+MAX_LOSS = 0.003  # largest loss of silhouette IoU by the stronger relaxation of a frame
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Effort:
 
     Attributes:
         rounds: at most; after the first one only around defects.
-        rings: of neighbors around a defect that give way with it.
-        yielding: factor of the pull around defects, from round to round.
+        rings: of neighbors around a defect whose pull is reduced too.
+        yielding: factor on the pull around defects, per round.
     """
 
     rounds: int
@@ -168,7 +168,7 @@ class ElasticBody:
         self._sound_at_rest = ~DefectFinder(faces).defective(rest)
 
     @cached_property
-    def _whole(self) -> SuperLU:
+    def _uniform_factors(self) -> SuperLU:
         """Factors for vertices that are all free and pulled alike; only `first_round` needs them."""
         return screened_factors(self.laplacian, np.full(len(self.rest), PULL))
 
@@ -191,7 +191,7 @@ class ElasticBody:
         return [np.isin(np.arange(len(moved)), corners[parts == part]) for part in np.unique(parts)]
 
     def rotations(self, moved: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "v 3 3"]:
-        """Return the rotation of every vertex that turns its edges at rest into the present ones best."""
+        """Return for every vertex the rotation that best aligns its edges at rest with the present ones."""
         rotations = np.empty((len(moved), 3, 3))
         _rotations(self.edges.indptr, self.edges.indices, self.rest, moved, np.arange(len(moved)), rotations)
         return rotations
@@ -248,16 +248,18 @@ class ElasticBody:
             if free is not None:
                 moved[rows] = factors.solve(wanted - held)
             else:
-                moved = self._whole.solve(wanted) if alike else solve_screened(self.edges, pull, wanted, moved)
+                moved = (
+                    self._uniform_factors.solve(wanted) if alike else solve_screened(self.edges, pull, wanted, moved)
+                )
         return moved
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _rotations(starts, neighbors, rest, moved, chosen, rotations):
-    """Write the rotation of every chosen vertex that turns its edges at rest into the present ones best."""
+def _rotations(starts, neighbors, rest, moved, selected, rotations):
+    """Write for every selected vertex the rotation that best aligns its edges at rest with the present ones."""
     covariance = np.zeros((3, 3))
-    for v in chosen:
+    for v in selected:
         covariance[:] = 0
         for k in range(starts[v], starts[v + 1]):
             j = neighbors[k]
@@ -269,9 +271,9 @@ def _rotations(starts, neighbors, rest, moved, chosen, rotations):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _forces(starts, neighbors, rest, rotations, chosen, forces):
-    """Write the right-hand side of chosen positions: edges at rest, turned by the mean rotation of both ends."""
-    for v in chosen:
+def _forces(starts, neighbors, rest, rotations, selected, forces):
+    """Write the right-hand side for selected vertices: edges at rest, turned by the mean rotation of both ends."""
+    for v in selected:
         forces[v] = 0
         for k in range(starts[v], starts[v + 1]):
             j = neighbors[k]

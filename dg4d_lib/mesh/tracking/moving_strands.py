@@ -38,20 +38,20 @@ from dg4d_lib.mesh.extraction.strands import (
 from dg4d_lib.mesh.folds import self_intersecting
 from dg4d_lib.mesh.neighbors import edge_graph, grown
 
-TRIED = 40  # strands of single frames, the longest first, at most
-NEW = 0.5  # share of the points of a strand that must not belong to one before it
-RINGS = 4  # of vertices around the root of a strand that it goes with
-TURNS_DEG, SCALES = np.arange(-60.0, 61, 5), np.arange(0.7, 1.31, 0.1)  # that are tried about the root
+TRIED = 40  # largest number of candidate strands, the longest first
+NEW = 0.5  # least share of the points of a strand that belong to no earlier one
+RINGS = 4  # rings of vertices around the root that carry the strand
+TURNS_DEG, SCALES = np.arange(-60.0, 61, 5), np.arange(0.7, 1.31, 0.1)  # trial rotations and scales about the root
 FAR = 24.0  # pixels from a middle line that count as lost
-EFFORT = 4.0  # pixels that a turn by 60 degrees, or half of the length, must gain
+EFFORT = 4.0  # pixels: gain required for a turn by 60 degrees, or a change by half of the length
 LOST = 3.0  # mean distance from middle lines, pixels, above which a frame does not show the strand
-SHOWN = 0.4  # share of its points that the surface must not cover there
-SEEN = 0.5  # share of the frames that must show it
+SHOWN = 0.4  # least share of its points that the surface does not cover
+SEEN = 0.5  # least share of the frames that show it
 STIFF = (3.0, 3.0, 2.0, 2.0, 1.0, 1.0)  # standard deviation of the steps of bending along the rings, by rounds
 SHARP = 0.5  # cosine between steps of a tracked line below which tracking has lost it
-SLOPES = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, -1.5, 1.5)  # of depth along a strand that are tried
-GENTLE = 4.0  # crossing faces per frame that a slope of 1 must save
-USED = 8.0  # pixels around a strand whose middle lines no other one takes
+SLOPES = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0, -1.5, 1.5)  # trial slopes of the depth along a strand
+GENTLE = 4.0  # crossing faces per frame that a slope of 1 must avoid
+USED = 8.0  # pixels around a strand whose middle lines are no targets of others
 
 Vertices = Float64[np.ndarray, "v 3"]
 Poses = Float64[np.ndarray, "p v 3"]  # of the frames, and of the rest shape
@@ -93,33 +93,33 @@ def grow_moving_strands(
     corners, covered = faces.numpy(), np.zeros((len(alpha), SIZE, SIZE), bool)
     targets, candidates = [np.zeros((0, 2))] * len(alpha), list[tuple[int, Strand]]()
 
-    def look(frame: int) -> None:
+    def find_candidates(frame: int) -> None:
         covered[frame] = covered_pixels(poses[frame], corners)
-        seen = _seen(alpha[frame], covered[frame])
+        seen = _uncovered_lines(alpha[frame], covered[frame])
         targets[frame] = _targets(seen)
         candidates.extend((frame, strand) for strand in find_strands(seen))
 
-    run_parallel([partial(look, frame) for frame in range(len(alpha))])
+    run_parallel([partial(find_candidates, frame) for frame in range(len(alpha))])
     candidates.sort(key=lambda one: (one[0] != reference_frame, -len(one[1].points), one[0]))
     tubes: tuple[Tube, ...] = ()
     tries = 0
     for frame, strand in candidates:
         if tries == TRIED:
             break
-        if len(targets[frame]) == 0 or _near(strand.points, targets[frame], USED / 2).mean() < NEW:
+        if len(targets[frame]) == 0 or _mark_near(strand.points, targets[frame], USED / 2).mean() < NEW:
             continue
         tries += 1
         larger = with_strand(Grown(poses[frame], corners, tubes), strand)
         if larger is None:
             continue
         moved = np.concatenate([poses, np.repeat(larger.vertices[None, poses.shape[1] :], len(poses), 0)], 1)
-        moved, lines, shown = _followed(larger.vertices, larger.faces, larger.tubes[-1], moved, targets, covered)
+        moved, lines, shown = _track_strand(larger.vertices, larger.faces, larger.tubes[-1], moved, targets, covered)
         if shown < SEEN:
             continue
         moved[frame] = larger.vertices
         corners, tubes = larger.faces, larger.tubes
-        poses = _sloped(moved, corners, tubes, len(tubes) - 1)
-        targets = _without(targets, lines)
+        poses = _best_slope(moved, corners, tubes, len(tubes) - 1)
+        targets = _drop_near(targets, lines)
     if not tubes:
         return vertices, offsets, faces, ()
     together = torch.from_numpy(poses).to(vertices)
@@ -144,24 +144,24 @@ def find_strands_again(
     """
     poses = torch.cat([vertices + offsets, vertices[None]]).double().numpy()
     corners, strands = faces.numpy(), np.zeros(len(vertices), bool)
-    strands[np.concatenate([_own(tube) for tube in tubes])] = True
+    strands[np.concatenate([_vertices_of(tube) for tube in tubes])] = True
     body = corners[~strands[corners].any(1)]
     covered, targets = np.zeros((len(alpha), SIZE, SIZE), bool), [np.zeros((0, 2))] * len(alpha)
 
-    def look(frame: int) -> None:
+    def find_targets(frame: int) -> None:
         covered[frame] = covered_pixels(poses[frame], body)
-        targets[frame] = _targets(_seen(alpha[frame], covered[frame]))
+        targets[frame] = _targets(_uncovered_lines(alpha[frame], covered[frame]))
 
-    run_parallel([partial(look, frame) for frame in range(len(alpha))])
+    run_parallel([partial(find_targets, frame) for frame in range(len(alpha))])
     for index, tube in enumerate(tubes):
-        poses, lines, _ = _followed(poses[-1], corners, tube, poses, targets, covered, known=True)
-        poses = _sloped(poses, corners, tubes, index)
-        targets = _without(targets, lines)
+        poses, lines, _ = _track_strand(poses[-1], corners, tube, poses, targets, covered, known=True)
+        poses = _best_slope(poses, corners, tubes, index)
+        targets = _drop_near(targets, lines)
     return torch.from_numpy(poses[:-1]).to(offsets) - vertices
 
 
-def _seen(alpha: Float[Tensor, "i j"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
-    """Return the middle lines of what the surface does not cover of a frame."""
+def _uncovered_lines(alpha: Float[Tensor, "i j"], covered: Bool[np.ndarray, "h w"]) -> MiddleLines:
+    """Return the middle lines of the parts of a frame that the surface does not cover."""
     return middle_lines(enlarged_masks(alpha[None], SIZE)[0].numpy(force=True), covered)
 
 
@@ -172,26 +172,28 @@ def _targets(lines: MiddleLines) -> Float64[np.ndarray, "p 2"]:
     return targets
 
 
-def _near(
+def _mark_near(
     points: Float64[np.ndarray, "p 2"], others: Float64[np.ndarray, "q 2"], distance: float
 ) -> Bool[np.ndarray, " p"]:
     """Mark the points that are near one of the others."""
     return np.asarray(cKDTree(others).query(points)[0]) < distance
 
 
-def _without(
+def _drop_near(
     targets: list[Float64[np.ndarray, "_ 2"]], lines: list[Float64[np.ndarray, "k 2"]]
 ) -> list[Float64[np.ndarray, "_ 2"]]:
     """Return the targets of every frame that are not near a line."""
-    return [here[~_near(here, line, USED)] if len(here) else here for here, line in zip(targets, lines, strict=True)]
+    return [
+        here[~_mark_near(here, line, USED)] if len(here) else here for here, line in zip(targets, lines, strict=True)
+    ]
 
 
-def _own(tube: Tube) -> Int[np.ndarray, " n"]:
+def _vertices_of(tube: Tube) -> Int[np.ndarray, " n"]:
     """Return the vertices of a strand."""
     return np.append(tube.rings.ravel(), tube.tip)
 
 
-def _followed(
+def _track_strand(
     shape: Vertices,
     faces: Int[np.ndarray, "f 3"],
     tube: Tube,
@@ -211,7 +213,7 @@ def _followed(
         covered: pixels of the mesh without the strand.
         known: the poses have the strand, where tracking left it.
     """
-    own, moved = _own(tube), poses.copy()
+    own, moved = _vertices_of(tube), poses.copy()
     near = np.zeros(len(shape), bool)
     near[tube.root] = True
     near = grown(near, edge_graph(faces, len(near)), RINGS)
@@ -220,14 +222,14 @@ def _followed(
 
     def carry(frame: int) -> None:
         pose = moved[frame]
-        tracked = _line(pose, tube)[0] if known and frame < len(targets) else None
+        tracked = _projected_line(pose, tube)[0] if known and frame < len(targets) else None
         pose[own] = shape[own] + (pose[near] - shape[near]).mean(0)
         if frame == len(targets):
             return
-        lines[frame], root = _line(pose, tube)
-        fits[frame] = _fitted(lines[frame], root, targets[frame], covered[frame])
-        if tracked is not None and _regular(tracked, lines[frame], root):
-            other = _fitted(tracked, root, targets[frame], covered[frame])
+        lines[frame], root = _projected_line(pose, tube)
+        fits[frame] = _fit_line(lines[frame], root, targets[frame], covered[frame])
+        if tracked is not None and _is_regular(tracked, lines[frame], root):
+            other = _fit_line(tracked, root, targets[frame], covered[frame])
             if other.line is None:
                 other = other._replace(line=tracked, distance=FAR)
             fits[frame] = min(fits[frame], other, key=lambda fit: np.inf if fit.line is None else fit.distance)
@@ -237,28 +239,28 @@ def _followed(
     if len(shown) == 0:
         return moved, lines, 0.0
     for frame, fit in enumerate(fits):
-        line, root = _line(moved[frame], tube)
+        line, root = _projected_line(moved[frame], tube)
         turn, scale = (np.interp(frame, shown, [getattr(fits[k], name) for k in shown]) for name in ("turn", "scale"))
-        lines[frame] = _turned(line, root, np.array([turn]), np.array([scale]))[0] if fit.line is None else fit.line
-        _place(shape, moved[frame], tube, lines[frame])
+        lines[frame] = _turn_lines(line, root, np.array([turn]), np.array([scale]))[0] if fit.line is None else fit.line
+        _place_strand(shape, moved[frame], tube, lines[frame])
     return moved, lines, len(shown) / len(targets)
 
 
-def _sloped(poses: Poses, faces: Int[np.ndarray, "f 3"], tubes: Sequence[Tube], index: int) -> Poses:
+def _best_slope(poses: Poses, faces: Int[np.ndarray, "f 3"], tubes: Sequence[Tube], index: int) -> Poses:
     """Return all poses with a strand in the slope, the same in all, at which it crosses few faces (`GENTLE`)."""
     own = np.zeros(poses.shape[1], bool)
-    own[_own(tubes[index])] = True
+    own[_vertices_of(tubes[index])] = True
     near, eye = own[faces].any(1), CAMERA.position().numpy()
     shifts = np.zeros_like(poses)
     for pose, shift in zip(poses, shifts, strict=True):
         tube = tubes[index]
-        middle = np.concatenate([pose[tube.root].mean(0, keepdims=True), _centers(pose, tube)])
+        middle = np.concatenate([pose[tube.root].mean(0, keepdims=True), _ring_centers(pose, tube)])
         lengths = np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum()
-        rays = pose[_own(tube)] - eye
-        shift[_own(tube)] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        shift[_own(tube)] *= np.append(np.repeat(lengths[:-1], len(tube.root)), lengths[-1])[:, None]
+        rays = pose[_vertices_of(tube)] - eye
+        shift[_vertices_of(tube)] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        shift[_vertices_of(tube)] *= np.append(np.repeat(lengths[:-1], len(tube.root)), lengths[-1])[:, None]
         for later in tubes[index + 1 :]:
-            shift[_own(later)] += shift[later.root].mean(0)  # strands that grew out of it go with it
+            shift[_vertices_of(later)] += shift[later.root].mean(0)  # strands that grew out of it go with it
     counts = np.zeros((len(SLOPES), len(poses)), np.int64)
 
     def count(pose: int) -> None:
@@ -271,17 +273,17 @@ def _sloped(poses: Poses, faces: Int[np.ndarray, "f 3"], tubes: Sequence[Tube], 
     return sloped
 
 
-def _line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:
+def _projected_line(pose: Vertices, tube: Tube) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "1 2"]]:
     """Return column and row of the middle line of a strand, and those of its root."""
-    return pixels_of(_centers(pose, tube))[0], pixels_of(pose[tube.root].mean(0, keepdims=True))[0]
+    return pixels_of(_ring_centers(pose, tube))[0], pixels_of(pose[tube.root].mean(0, keepdims=True))[0]
 
 
-def _place(shape: Vertices, pose: Vertices, tube: Tube, line: Float64[np.ndarray, "k 2"]) -> None:
+def _place_strand(shape: Vertices, pose: Vertices, tube: Tube, line: Float64[np.ndarray, "k 2"]) -> None:
     """Move a strand to a line in the picture, at the depth that it has; its rings are those of the shape, turned."""
-    centers = _centers(pose, tube)
+    centers = _ring_centers(pose, tube)
     step = line - pixels_of(centers)[0]
     after = centers + step * pixels_of(centers)[1][:, None] / CAMERA.focal @ CAMERA.viewmat().numpy()[:2, :3]
-    before = _centers(shape, tube)
+    before = _ring_centers(shape, tube)
     directions = zip(_directions(shape, tube, before), _directions(pose, tube, after), strict=True)
     turns = [Rotation.align_vectors(to[None], along[None])[0] for along, to in directions]
     for ring, center, new, turn in zip(tube.rings, before, after, turns, strict=False):
@@ -289,7 +291,7 @@ def _place(shape: Vertices, pose: Vertices, tube: Tube, line: Float64[np.ndarray
     pose[tube.tip] = after[-1]
 
 
-def _centers(pose: Vertices, tube: Tube) -> Float64[np.ndarray, "k 3"]:
+def _ring_centers(pose: Vertices, tube: Tube) -> Float64[np.ndarray, "k 3"]:
     """Return the middle line of a strand."""
     return np.concatenate([pose[tube.rings].mean(1), pose[tube.tip, None]])
 
@@ -301,7 +303,7 @@ def _directions(pose: Vertices, tube: Tube, centers: Float64[np.ndarray, "k 3"])
     return directions
 
 
-def _turned(
+def _turn_lines(
     line: Float64[np.ndarray, "k 2"],
     root: Float64[np.ndarray, "1 2"],
     turns: Float64[np.ndarray, " n"],
@@ -314,7 +316,7 @@ def _turned(
     return turned
 
 
-def _fitted(
+def _fit_line(
     line: Float64[np.ndarray, "k 2"],
     root: Float64[np.ndarray, "1 2"],
     targets: Float64[np.ndarray, "p 2"],
@@ -332,7 +334,7 @@ def _fitted(
         return near, covered[rows, columns]
 
     turns, scales = (grid.ravel() for grid in np.meshgrid(np.radians(TURNS_DEG), SCALES))
-    tried = _turned(line, root, turns, scales)
+    tried = _turn_lines(line, root, turns, scales)
     near, hidden = distances(tried)
     costs = np.where(hidden, NEAR, near).mean(-1) + EFFORT * (np.abs(turns) / np.radians(60) + 2 * np.abs(scales - 1))
     best = costs.argmin()
@@ -351,7 +353,7 @@ def _fitted(
     return Fit(bent if shown else None, float(turns[best]), float(scales[best]), distance)
 
 
-def _regular(
+def _is_regular(
     line: Float64[np.ndarray, "k 2"], other: Float64[np.ndarray, "k 2"], root: Float64[np.ndarray, "1 2"]
 ) -> bool:
     """Return whether a line has the length of another one, about, and no sharp bend."""

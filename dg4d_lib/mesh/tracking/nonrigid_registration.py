@@ -39,7 +39,7 @@ def register_nonrigid(
     silhouettes: Bool[Tensor, "t k h w"],
     level: float,
     settings: MeshSettings,
-) -> tuple[Float[Tensor, "t v 3"], Float[Tensor, " t"]]:
+) -> Float[Tensor, "t v 3"]:
     """Register the mesh in frames where its silhouettes differ from those of the Gaussians.
 
     Args:
@@ -52,12 +52,12 @@ def register_nonrigid(
         settings: mesh settings.
 
     Returns:
-        The offsets, and the silhouette IoU at every frame with them, in [0, 1], never lower than before.
+        The offsets; no frame's silhouette IoU is lower than before.
     """
     ious = silhouette_iou(vertices + offsets, faces, silhouettes)
     failed = torch.nonzero(ious < MIN_IOU)[:, 0].tolist()
     if not failed:
-        return offsets, ious
+        return offsets
     identity, laplacian = eye_array(len(vertices)), graph_laplacian(edge_graph(faces.numpy(), len(vertices)))
     smooth = {stiffness: splu(csc_array(identity + stiffness * laplacian)) for stiffness in set(STIFFNESS)}
     registered = offsets.clone()
@@ -77,7 +77,7 @@ def register_nonrigid(
                 ious[frame], registered[frame] = iou, moved - vertices
 
     run_parallel([partial(register_frame, frame) for frame in failed])
-    return registered, ious
+    return registered
 
 
 def closest_steps(
@@ -94,10 +94,10 @@ def closest_steps(
     steps = targets[(tree or cKDTree(targets)).query(points)[1], :axes] - points[:, :axes]
     nearest = cKDTree(points).query(targets)[1]
     count = np.bincount(nearest, minlength=len(points))
-    chosen = count > 0  # points that are nearest to some target
+    selected = count > 0  # points that are nearest to some target
     for axis in range(axes):
-        back = np.bincount(nearest, targets[:, axis], len(points))[chosen] / count[chosen] - points[chosen, axis]
-        steps[chosen, axis] = 0.5 * (steps[chosen, axis] + back)
+        back = np.bincount(nearest, targets[:, axis], len(points))[selected] / count[selected] - points[selected, axis]
+        steps[selected, axis] = 0.5 * (steps[selected, axis] + back)
     return steps
 
 

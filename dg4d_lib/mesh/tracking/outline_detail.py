@@ -21,11 +21,11 @@ from dg4d_lib.mesh.tracking.outline_registration import outline_of, outline_step
 
 SIZE = 1024  # pixels of the compared outlines
 ROUNDS = 5
-PASSES = 3  # at most, of so many rounds
-HELD = 0.1  # share of the motion of a pass, undone because of new defects, up to which there is no other pass
-LONGEST = 8.0  # pixels of a step; what is farther off is not detail
+PASSES = 3  # largest number, each of `ROUNDS` rounds
+HELD = 0.1  # share of a pass undone because of new defects, above which another pass follows
+LONGEST = 8.0  # pixels of a step; larger distances are not detail
 PULL = 10.0  # weight of the step of a vertex on the outline, against 1 for the difference along each of its edges
-STAY = 0.05  # weight of no step, of every vertex: half of a step is left after 4 edges
+STAY = 0.05  # weight of a zero step of every vertex: steps fall to half after 4 edges
 
 
 def fit_outline_detail(

@@ -40,9 +40,9 @@ LONGEST = 24.0  # pixels of a step
 BLUR = 2.0  # standard deviation of the mask whose gradient is the normal of an outline, pixels
 FIRST_ROUNDS = ((2, 6),)  # passes to the isosurface alone, and to outlines too; then folds and crossings are smoothed
 LAST_ROUNDS = ((0, 2), (0, 2))  # smoothing draws outlines in a little, so they are fitted again
-GOOD_OVERLAP = 0.97  # with the silhouette of the video, IoU, above which a frame needs no other start
-GAIN = 0.005  # of the overlap by which another start must be better
-SPEED = 0.5  # share of the last step that goes on beyond the middle of a loop
+GOOD_OVERLAP = 0.97  # IoU with the silhouette of the video, above which a frame needs no other start
+GAIN = 0.005  # least gain of IoU by another start
+SPEED = 0.5  # share of the last step that is extrapolated beyond the middle of a loop
 ROTATIONS = 2  # alternations of rotations and positions per pass
 PULL, OUTLINE_PULL = 0.5, 3.0  # weights of the positions of vertices, on outlines and elsewhere, against 1 per edge
 
@@ -116,8 +116,8 @@ def register_to_outlines(
     black = torch.zeros(3, device=states.means.device)
     for camera in cameras[1:]:
         with torch.no_grad():
-            drawn = [rasterize(states.at(frame), [camera], black).alpha[0, ..., 0] for frame in range(len(offsets))]
-        masks.append(torch.stack(drawn) > ALPHA_THRESHOLD)
+            alphas = [rasterize(states.at(frame), [camera], black).alpha[0, ..., 0] for frame in range(len(offsets))]
+        masks.append(torch.stack(alphas) > ALPHA_THRESHOLD)
     body = ElasticBody(vertices.double().numpy(), faces.numpy())
     smooth = bump_filter(body.rest, body.faces, settings.fairing)
     registered, overlaps = offsets.clone(), [-1.0] * len(offsets)

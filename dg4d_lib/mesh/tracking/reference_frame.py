@@ -24,7 +24,7 @@ from dg4d_lib.settings import MeshSettings
 CANDIDATES = 10  # candidate frames
 COMPARED = 8  # frames at which silhouettes are compared
 GRID = 64  # cells per axis of the candidates' density field
-SHORTEST = 1e-3  # of an edge, relative to its length at rest; shorter ones count as this
+SHORTEST = 1e-3  # length of an edge at which it is clamped, relative to its length at rest
 GAIN = 0.005  # intersection over union that a candidate must gain over the first frame, else the first is kept
 
 

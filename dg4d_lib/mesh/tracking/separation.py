@@ -32,19 +32,19 @@ PULLS = (20.0, 20.0, 0.05)  # weights of shifts to the right, up and along the r
 BRACE = 3.0  # largest weight of an edge of the nodes, which grows with its length
 FRAMES = 1.0  # weight of an edge from a node to itself at the next frame
 PUSH = 10.0  # weight of a contact
-ROUNDS = 16  # of finding contacts and pushing, at most
+ROUNDS = 16  # largest number of rounds of contact search and pushing
 PATIENCE = 6  # rounds without fewer crossings, after which pushing ends
 SLACK = 0.004  # world units between parts
-STEP = 0.03  # world units that a contact is pushed in a round, at most
-ALIKE = 0.3  # cosine between the push of a contact and that of its surroundings, below which it does not count
+STEP = 0.03  # largest push of a contact in a round, world units
+ALIKE = 0.3  # least cosine between the push of a contact and that of its surroundings
 STEADY = 3.0  # frames, standard deviation: over which the direction is averaged
-MANY, EVERY = 60, 3  # of more submerged vertices of a frame than that, every third makes a contact
+MANY, EVERY = 60, 3  # in frames with more submerged vertices than this, every third one makes a contact
 TOLERANCE, ITERATIONS = 1e-3, 60  # of the linear solver
-GAIN = 0.5  # share of the crossings that must go for the push to be kept
-LOOSE = 1e-6  # pull of a cap's vertices to where they are, against 1 per edge: holds pieces that lie inside as a whole
+GAIN = 0.5  # least share of resolved crossings for which a push is kept
+LOOSE = 1e-6  # pull of a cap's vertices to their positions, against 1 per edge: holds pieces that are inside entirely
 KEPT = 0.02  # share of the distance to the membrane that is kept, so that a long limb does not shrink to a point
 GRAIN = 3e-5  # world units, about a step of positions in files; crossings are counted after rounding to it
-CAPS = (1, 2, 4, 6, 8)  # rings of vertices around what is submerged that shrink with it, one attempt after the other
+CAPS = (1, 2, 4, 6, 8)  # rings of vertices around submerged ones that shrink with them, one attempt after the other
 
 
 def separate(
@@ -187,7 +187,7 @@ def _submerged(
     centers: Float64[np.ndarray, "t b 3"],
     crossing: Bool[np.ndarray, "t f"],
 ) -> tuple[list[Submerged], Float64[np.ndarray, "t m 3"]]:
-    """Return what is submerged at each frame, near its crossing faces, and `_pushes` of each."""
+    """Return the submerged vertices of each frame, near its crossing faces, and `_pushes` of each."""
     found = dict[int, Submerged]()
     pushes = np.zeros((len(moved), len(balls.control.nodes), 3))
 
@@ -233,8 +233,8 @@ def _contacts(
     """Return vertices and balls that are to be pushed apart: those whose push agrees with its surroundings."""
     towards = _unit(moved[inside.vertices] - centers[inside.balls])
     agrees = (towards * _unit(directions[balls.node[inside.vertices]])).sum(1) > ALIKE
-    chosen = np.stack([inside.vertices[agrees], inside.balls[agrees]], 1)
-    return chosen if len(chosen) <= MANY else chosen[chosen[:, 0] % EVERY == 0]
+    selected = np.stack([inside.vertices[agrees], inside.balls[agrees]], 1)
+    return selected if len(selected) <= MANY else selected[selected[:, 0] % EVERY == 0]
 
 
 class _Shifts:

@@ -12,7 +12,6 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.geometry.rotation import nearest_rotation
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.kernels.workers import run_parallel
 
 NEIGHBORS = 24  # Gaussians per vertex

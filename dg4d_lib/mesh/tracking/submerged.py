@@ -10,24 +10,24 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from dg4d_lib.geometry.normals import vertex_normals
+from dg4d_lib.kernels.compiling import njit
 from dg4d_lib.mesh.models.control_graph import ControlGraph, build_control_graph, graph_distances, surface_graph
 from dg4d_lib.mesh.neighbors import faces_to_vertices, grown
 from dg4d_lib.mesh.tracking.elastic import ElasticBody
 
 NODES = 300  # control nodes
 LARGEST, SMALLEST = 0.5, 0.01  # radii of balls, world units: the first guess, and the smallest that count
-SHRINKINGS = 30  # at most, of every ball
-WIDE = 0.9  # radii between both places of a ball, at least: seen from its center they are 53 degrees apart
+SHRINKINGS = 30  # largest number of shrinking steps per ball
+WIDE = 0.9  # least distance of both contact points of a ball, in radii: 53 degrees seen from its center
 TOUCHING = 8  # vertices nearest to a center, the farthest of which from the ball's own vertex is its second place
 FAR = 0.06  # world units: another part begins farther than this and half of a ball's circumference along the surface
 OUTSIDE = 1.3  # radii: nodes nearer to the center at rest belong to the ball's own part
-THINNER = 0.8  # of its own ball's radius: smaller balls hold no vertex, for the thicker part decides the direction
+THINNER = 0.8  # least radius of a ball relative to a vertex's own ball: the thicker part decides the direction
 
 
 class Submerged(NamedTuple):

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument
+from dg4d_lib.assets.formats.gltf import VERTEX_DATA, GlbReader, GltfDocument, padded_rows
 from dg4d_lib.errors import BadInput
 
 
@@ -33,6 +33,25 @@ def test_views_start_at_multiples_of_four_and_padding_is_zero() -> None:
     document.add_view("next", b"f")
     assert [view["byteOffset"] for view in document.tree["bufferViews"]] == [0, 8]
     assert bytes(document.binary) == b"abcde\0\0\0f\0\0\0"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "width", "padded"), [("u1", 3, 4), ("u1", 4, 4), ("u1", 5, 8), ("<i2", 3, 4), ("<f4", 3, 3)]
+)
+def test_rows_of_vertices_are_padded_with_zeros_to_whole_words(dtype: str, width: int, padded: int) -> None:
+    rows = np.ones((2, width), dtype)
+    expected = np.zeros((2, padded), dtype)
+    expected[:, :width] = 1
+    assert np.array_equal(padded_rows(rows), expected)
+
+
+def test_readers_without_the_compression_are_told_to_reject_the_file() -> None:
+    pytest.importorskip("meshoptimizer")
+    document, points = GltfDocument({}, compressed=True), np.arange(9, dtype="<f4").reshape(3, 3)
+    number = document.add_accessor("points", points, VERTEX_DATA)
+    parsed = GlbReader(document.to_bytes())
+    assert np.array_equal(parsed.accessor(number), points)
+    assert parsed.tree["extensionsRequired"] == parsed.tree["extensionsUsed"] == ["EXT_meshopt_compression"]
 
 
 def test_chunks_are_padded_and_announced_with_their_true_length() -> None:
@@ -63,6 +82,11 @@ def test_an_accessor_beyond_its_view_is_not_read(extra: int) -> None:
     document.tree["accessors"][number]["count"] += extra
     with pytest.raises((TypeError, ValueError)):
         GlbReader(document.to_bytes()).accessor(number)
+
+
+def test_a_container_of_another_kind_is_refused_by_its_first_bytes() -> None:
+    with pytest.raises(BadInput, match="not a GLB: it starts with b'glTX'"):
+        GlbReader(b"glTX" + GltfDocument({}).to_bytes()[4:])
 
 
 @pytest.mark.parametrize("keep", [0, 3, 11, 19, 24])

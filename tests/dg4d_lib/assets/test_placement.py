@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dg4d_lib.assets.animated import Asset4D
-from dg4d_lib.assets.placement import Placement, place
+from dg4d_lib.assets.placement import Placement, ground_placement
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.mesh.textured import TexturedMesh
@@ -33,7 +33,7 @@ def cloud() -> Gaussians:
 
 
 def test_the_lowest_point_is_on_the_ground_and_the_center_above_the_origin() -> None:
-    placed = place(rising(), 0.0, True).surface(rising())
+    placed = ground_placement(rising(), 0.0, True).surface(rising())
     poses = placed.mesh.vertices + placed.offsets
     low, high = poses.amin((0, 1)), poses.amax((0, 1))
     torch.testing.assert_close(low, torch.tensor([-3.0, 0.0, -2.0]))
@@ -42,7 +42,7 @@ def test_the_lowest_point_is_on_the_ground_and_the_center_above_the_origin() -> 
 
 @pytest.mark.parametrize("ground", [False, True])
 def test_the_first_frame_has_the_height_asked_for(ground: bool) -> None:
-    placed = place(rising(), 0.3, ground).surface(rising())
+    placed = ground_placement(rising(), 0.3, ground).surface(rising())
     first = placed.mesh.vertices + placed.offsets[0]
     assert float(first[:, 1].max() - first[:, 1].min()) == pytest.approx(0.3)
     assert float(placed.offsets[2, 0, 0]) == pytest.approx(4 * 0.15)
@@ -51,11 +51,11 @@ def test_the_first_frame_has_the_height_asked_for(ground: bool) -> None:
 def test_meshes_per_frame_are_placed_as_a_tracked_mesh() -> None:
     asset = rising()
     meshes = [replace(asset.mesh, vertices=asset.mesh.vertices + offsets) for offsets in asset.offsets]
-    assert place(meshes, 0.3, True) == place(asset, 0.3, True)
+    assert ground_placement(meshes, 0.3, True) == ground_placement(asset, 0.3, True)
 
 
 def test_without_height_and_ground_nothing_changes() -> None:
-    assert place(rising(), 0.0, False) == Placement()
+    assert ground_placement(rising(), 0.0, False) == Placement()
     assert torch.equal(Placement().surface(rising()).mesh.vertices, rising().mesh.vertices)
     assert torch.equal(Placement().gaussians(cloud()).log_scales, cloud().log_scales)
 
@@ -77,4 +77,4 @@ def test_the_inverse_leads_back() -> None:
 
 def test_a_flat_mesh_has_no_height_to_scale() -> None:
     with pytest.raises(BadInput, match=r"flat; set pack\.height_m=0"):
-        place([box((0, 1, 0), (1, 1, 1))], 0.3, True)
+        ground_placement([box((0, 1, 0), (1, 1, 1))], 0.3, True)

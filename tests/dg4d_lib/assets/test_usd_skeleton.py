@@ -67,6 +67,22 @@ def test_usdskel_moves_the_mesh_as_the_rig_says(skinned: tuple[Path, Asset4D, Ri
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (24, 24 * FRAMES / FPS)
 
 
+def test_the_joints_at_rest_are_where_the_mesh_was_bound(skinned: tuple[Path, Asset4D, Rig]) -> None:
+    stage = Usd.Stage.Open(str(skinned[0]))
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(stage.GetPrimAtPath("/asset/mesh")), Usd.PrimDefaultPredicate)
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/asset/mesh/rig"))
+    rest = cache.GetSkelQuery(skeleton).ComputeJointSkelTransforms(0, atRest=True)
+    np.testing.assert_allclose(np.array(rest), np.array(skeleton.GetBindTransformsAttr().Get()), atol=1e-6)
+
+
+def test_readers_that_ignore_time_see_the_first_frame(skinned: tuple[Path, Asset4D, Rig]) -> None:
+    stage = Usd.Stage.Open(str(skinned[0]))
+    motion = UsdSkel.Animation(stage.GetPrimAtPath("/asset/mesh/rig/motion"))
+    for attribute in (motion.GetRotationsAttr(), motion.GetTranslationsAttr()):
+        assert attribute.Get() == attribute.Get(0) != attribute.Get(24 / FPS)
+
+
 def test_the_mesh_at_rest_is_that_of_the_asset(skinned: tuple[Path, Asset4D, Rig]) -> None:
     path, asset, _ = skinned
     (seen,) = run_node("read_usdz.mjs", str(path))["meshes"]

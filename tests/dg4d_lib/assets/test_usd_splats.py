@@ -49,6 +49,16 @@ def test_splats_are_the_states(path: Path) -> None:
     assert Usd.ColorSpaceAPI(splats.GetPrim()).GetColorSpaceNameAttr().Get() == Gf.ColorSpaceNames.SRGBRec709
 
 
+def test_colors_that_are_the_same_from_all_sides_have_degree_zero(path: Path) -> None:
+    states = cloud(bases=1)
+    write_usdz(path, growing_ball(), FPS, states)
+    stage = Usd.Stage.Open(str(path))
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/asset/splats"))
+    assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 0
+    colors = UsdGeom.Primvar(splats.GetRadianceSphericalHarmonicsCoefficientsAttr())
+    assert (len(colors.Get()), colors.GetElementSize()) == (5, 1)
+
+
 def test_half_splats_are_the_states_to_eleven_bits(path: Path) -> None:
     states = replace(cloud(), log_scales=torch.linspace(-20, 1, FRAMES * 15).reshape(FRAMES, 5, 3))
     write_usdz(path, growing_ball(), FPS, states, half=True)

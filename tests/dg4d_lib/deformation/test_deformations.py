@@ -10,7 +10,7 @@ from dg4d_lib.deformation.factory import new_deformation
 from dg4d_lib.deformation.framewise import Framewise
 from dg4d_lib.deformation.hexplane import HexPlane, plane_features, time_lines
 from dg4d_lib.deformation.interface import Deformation
-from dg4d_lib.deformation.mlp import Mlp
+from dg4d_lib.deformation.mlp import Mlp, encode
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.initialize import blob
 from dg4d_lib.settings import FramewiseSettings, HexPlaneSettings, MlpSettings
@@ -98,6 +98,42 @@ def test_displacements_and_gradients_are_those_of_three_residual_heads(cloud, mo
     truth = torch.autograd.grad(outputs, list(exact.parameters()), [value.double() for value in cotangents])
     for gradient, true_gradient in zip(found, truth, strict=True):
         assert (gradient - true_gradient).norm() / true_gradient.norm() < 1e-5
+
+
+def test_the_encoding_doubles_its_frequency_from_octave_to_octave():
+    x, y = values = torch.tensor([0.1, 0.7])
+    angles = torch.pi * torch.stack([x, y, 2 * x, 2 * y, 4 * x, 4 * y])
+    torch.testing.assert_close(encode(values, 3), torch.cat([values, angles.sin(), angles.cos()]))
+
+
+def test_the_network_sees_positions_and_times_from_minus_one_to_one(cloud):
+    field, times = make("mlp"), torch.tensor([0.0, 0.4, 1.0])
+    for parameter in field.heads.parameters():
+        torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(2))
+    places = torch.cat([(cloud.means / 0.6).expand(3, -1, -1), (2 * times - 1)[:, None, None].expand(3, COUNT, 1)], -1)
+    expected = field.heads(field.second, field.first(encode(places, 3)).relu())
+    torch.testing.assert_close(field.displace(cloud.means, times).means, expected.means)
+
+
+@pytest.mark.parametrize("kind", ["hexplane", "mlp"])
+def test_the_last_frame_lies_where_the_time_axis_is_told(kind: str, cloud):
+    whole = make(kind)
+    for parameter in whole.parameters():
+        torch.nn.init.uniform_(parameter, 0.1, 0.5, generator=torch.Generator().manual_seed(2))
+    part, times = deepcopy(whole), torch.tensor([0.0, 0.4, 1.0])
+    part.last = 0.75
+    found = part.displace(cloud.means, times).means
+    torch.testing.assert_close(found, whole.displace(cloud.means, 0.75 * times).means)
+    assert not torch.allclose(found[2], whole.displace(cloud.means, times).means[2])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_begins_the_same_for_the_same_seed(kind: str):
+    torch.manual_seed(1)
+    first = make(kind)
+    torch.manual_seed(2)
+    for ours, theirs in zip(first.parameters(), make(kind).parameters(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_time_lines_are_exact_on_the_steps_and_linear_between():

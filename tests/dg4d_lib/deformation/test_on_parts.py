@@ -37,7 +37,7 @@ def lid(cloud: Gaussians, flip: float = 1.0) -> OnParts:
 
 
 @pytest.mark.parametrize("flip", [1.0, -1.0])  # a quaternion and its negative are one rotation
-@pytest.mark.parametrize("time", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("time", [0.0, 0.25, 0.5, 0.75, 1.0])
 def test_gaussians_move_with_their_part(cloud: Gaussians, flip: float, time: float) -> None:
     moved = lid(cloud, flip).displace(cloud.means, torch.tensor([time])).apply(cloud)
     angle, upper = ANGLES[-1] * time, cloud.means[:, 1] > 0
@@ -68,6 +68,12 @@ def test_a_video_of_one_frame_stays(cloud: Gaussians) -> None:
     deformation = OnParts(Framewise(1, COUNT), owners, cloud.quats, torch.zeros(1, 3), quats, torch.zeros(1, 1, 3))
     moved = deformation.displace(cloud.means, torch.tensor([0.0, 1.0])).apply(cloud)
     torch.testing.assert_close(moved.means, cloud.means.expand(2, -1, -1))
+
+
+def test_a_cloud_without_gaussians_stays_empty() -> None:
+    owners, turn, place = torch.zeros(0, dtype=torch.long), torch.tensor([[[1.0, 0, 0, 0]]]), torch.zeros(1, 1, 3)
+    deformation = OnParts(Framewise(1, 0), owners, torch.zeros(0, 4), torch.zeros(1, 3), turn, place)
+    assert deformation.displace(torch.zeros(0, 3), torch.tensor([0.0, 1.0])).means.shape == (2, 0, 3)
 
 
 def test_other_gaussians_and_parts_are_refused(cloud: Gaussians) -> None:

@@ -31,6 +31,23 @@ def test_stretching_costs():
     assert rigidity_loss(states, *neighborhoods(states.means[0])) > 1e-3
 
 
+def test_the_loss_is_the_mean_change_of_offsets_weighted_by_the_distance_at_rest():
+    """Two Gaussians 0.02 apart move to 0.05 in the first of two steps; Luiten et al. weight by exp(-2000 d^2)."""
+    cloud = blob(2, 0.05, torch.Generator().manual_seed(0))
+    means = torch.zeros(3, 2, 3)
+    means[:, 1, 0] = torch.tensor([0.02, 0.05, 0.05])
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(3, 2, 4)
+    states = Gaussians(means, torch.zeros(3, 2, 3), quats, cloud.opacity_logits, cloud.harmonics)
+    expected = torch.tensor(-2000 * 0.02**2).exp() * 0.03 / 2
+    torch.testing.assert_close(rigidity_loss(states, *neighborhoods(means[0])), expected)
+
+
+def test_one_frame_has_no_rigidity_loss():
+    cloud = blob(3, 0.05, torch.Generator().manual_seed(0))
+    first = Gaussians(cloud.means[None], cloud.log_scales[None], cloud.quats[None], *list(vars(cloud).values())[3:])
+    assert rigidity_loss(first, *neighborhoods(cloud.means)) == 0
+
+
 def test_no_gaussian_is_its_own_neighbor() -> None:
     """Of the four at one place, all are equally near."""
     indices, weights = neighborhoods(torch.tensor([[0.0, 0, 0]] * 4 + [[1.0, 0, 0]]), 2)

@@ -262,11 +262,11 @@ def test_loops_are_tracked_from_both_ends(
     loop = DrivingVideo(video.frames[there_and_back], video.alpha[there_and_back], 5.0)
     seen = []
 
-    def tracked(self: FlowTracker, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
+    def track(self: FlowTracker, poses: Mapping[int, Pose], trail: Sequence[int], frame: int) -> Pose:
         seen.append((list(trail), frame))
         return poses[trail[-1]]
 
-    monkeypatch.setattr(FlowTracker, "tracked", tracked)
+    monkeypatch.setattr(FlowTracker, "track", track)
     quick = SETTINGS.model_copy(update={"joint_iterations": 0})
     found = fit_asset_motion(
         surface.cloud, graph.of(surface.nearest), loop, get_rasterizer("cpu"), quick, torch.Generator()

@@ -62,7 +62,7 @@ def test_gauss_newton_recovers_a_rigid_motion_from_exact_pixels() -> None:
     targets = _Targets(np.arange(len(points)), tracker._projected(truth)[0], np.ones(len(points)))
     pose = rest = Pose.rest(len(tracker._nodes))
     for _ in range(15):
-        pose = tracker._solved(pose, targets, rest, rest)
+        pose = tracker._gauss_newton_step(pose, targets, rest, rest)
     found = tracker._points(pose, np.arange(len(points)))[0]
     assert np.abs(found - truth).max() < 1e-3  # in depth, too: perspective shows it
     np.testing.assert_allclose(pose.turns, np.tile(turn, (len(pose.turns), 1, 1)), atol=1e-3)
@@ -74,7 +74,7 @@ def test_a_part_that_jumps_farther_than_its_size_is_found() -> None:
     moved[800:, 1] += 0.4  # the ball is 0.18 wide
     tracker = tracker_of(moved)
     rest = Pose.rest(len(tracker._nodes))
-    targets = tracker._patches(rest, 1)
+    targets = tracker._patch_targets(rest, 1)
     steps = targets.pixels - tracker._projected(points[targets.rows])[0]
     expected = tracker._projected(moved[targets.rows])[0] - tracker._projected(points[targets.rows])[0]
     ball = (targets.rows >= 800) & (np.abs(points[targets.rows, 0] + 0.35) < 0.05)
@@ -82,7 +82,7 @@ def test_a_part_that_jumps_farther_than_its_size_is_found() -> None:
         np.abs(np.median(steps[ball], 0) - np.median(expected[ball], 0)).max() <= 2
     )  # pixels: half the size is searched
     assert targets.weights[ball].min() > 0.25
-    after = tracker._points(tracker.tracked({0: rest}, [0], 1), np.arange(len(points)))[0]
+    after = tracker._points(tracker.track({0: rest}, [0], 1), np.arange(len(points)))[0]
     error = np.linalg.norm(after - moved, axis=1)
     assert "_parts" in vars(tracker)  # flow alone loses it
     assert np.median(error[800:]) < 0.2 and np.median(error[:800]) < 0.12  # of 0.4; the block hangs on it
@@ -92,7 +92,7 @@ def test_a_still_video_moves_nothing() -> None:
     points, _ = scene()
     tracker = tracker_of(points)
     rest = Pose.rest(len(tracker._nodes))
-    after = tracker._points(tracker.tracked({0: rest}, [0], 1), np.arange(len(points)))[0]
+    after = tracker._points(tracker.track({0: rest}, [0], 1), np.arange(len(points)))[0]
     assert np.abs(after - points).max() < 0.01
     assert "_parts" not in vars(tracker)  # a search takes seconds, and nothing is lost
 
@@ -106,7 +106,7 @@ def test_splats_at_one_place_are_tracked() -> None:
     graph = graph_of_points(twice, point_graph(twice), len(twice))
     tracker = FlowTracker(cloud, graph, drawn.color, drawn.alpha, get_rasterizer("cpu"), SETTINGS)
     rest = Pose.rest(len(graph.nodes))
-    assert np.isfinite(tracker.tracked({0: rest}, [0], 1).shifts).all()
+    assert np.isfinite(tracker.track({0: rest}, [0], 1).shifts).all()
     assert find_parts(graph)
 
 
@@ -123,7 +123,7 @@ def test_depth_is_not_extrapolated() -> None:
     nothing = _Targets(np.arange(0), np.zeros((0, 2)), np.zeros(0))
     pose = rest
     for _ in range(5):
-        pose = tracker._solved(pose, nothing, expected, rest)
+        pose = tracker._gauss_newton_step(pose, nothing, expected, rest)
     np.testing.assert_allclose(pose.shifts.mean(0), (0.1 / 1.15, 0, 0), atol=1e-4)
 
 
@@ -136,7 +136,7 @@ def test_a_mirror_plane_tells_depth(side: float) -> None:
         targets = _Targets(np.arange(len(points)), pixels + slope @ (0.08, 0.05, 0), np.ones(len(points)))
         pose = rest = Pose.rest(len(tracker._nodes))
         for _ in range(8):
-            pose = tracker._solved(pose, targets, rest, rest)
+            pose = tracker._gauss_newton_step(pose, targets, rest, rest)
         np.testing.assert_allclose(pose.shifts.mean(0), (0.08, 0.05, depth), atol=0.02)
 
 

@@ -17,6 +17,13 @@ def test_resizing_is_over_white_and_does_not_bleed_hidden_color():
     torch.testing.assert_close(color[0, :, 0], torch.tensor([[0.0, 1.0, 0.0]]).expand(4, 3))
 
 
+@pytest.mark.parametrize(("height", "width"), [(4, 8), (8, 4), (4, 4)])
+def test_cutouts_become_square_also_where_one_side_fits_already(height: int, width: int):
+    color, alpha = resize_cutouts(torch.ones(2, height, width, 4), 4)
+    torch.testing.assert_close(color, torch.ones(2, 4, 4, 3))
+    torch.testing.assert_close(alpha, torch.ones(2, 4, 4, 1))
+
+
 def test_the_reference_loss_is_its_two_weighted_means():
     rendering = Rendering(
         torch.full((2, 4, 4, 3), 0.5), torch.full((2, 4, 4, 1), 0.5), torch.zeros(2, 4, 4, 1), torch.ones(2, 1).bool()

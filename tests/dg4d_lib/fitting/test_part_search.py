@@ -82,7 +82,7 @@ def test_parts_do_not_depend_on_the_run() -> None:
 def test_a_turned_arm_is_found(angle: int) -> None:
     points, arm = body_with_arm()
     search, graph, moved = search_of(Rotation.from_rotvec([0, 0, np.deg2rad(angle)]))
-    found = moved_points(graph, search.posed(Pose.rest(len(graph.nodes)), 1), points)
+    found = moved_points(graph, search.best_pose(Pose.rest(len(graph.nodes)), 1), points)
     far = arm & (points[:, 0] > 0.4)
     before, after = (np.linalg.norm(one - moved, axis=1) for one in (points, found))
     assert before[far].mean() > 0.25 and after[far].mean() < 0.3 * before[far].mean()
@@ -92,7 +92,7 @@ def test_a_turned_arm_is_found(angle: int) -> None:
 def test_a_pose_that_fits_stays() -> None:
     search, graph, _ = search_of(Rotation.identity())
     rest = Pose.rest(len(graph.nodes))
-    assert search.posed(rest, 0) is rest
+    assert search.best_pose(rest, 0) is rest
 
 
 @pytest.mark.parametrize(("nodes", "sizes"), [(4, []), (6, [3])])

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dg4d_lib.fitting.node_motion import NodeMotion
-from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts, keep_pieces_whole
+from dg4d_lib.fitting.rigid_parts import RigidMotion, _Moments, find_rigid_parts, keep_pieces_rigid
 from dg4d_lib.mesh.models.control_graph import ControlGraph
 
 FRAMES = 5
@@ -118,7 +118,7 @@ def test_pieces_nearly_of_one_part_move_with_it_alone(points: torch.Tensor) -> N
     )
     blended.weights[:3] = torch.tensor([0.2, 0.8])  # three points that the other part moves
     motion = lid(graph).of_nodes(graph)
-    whole = motion.points(points, keep_pieces_whole(blended, motion.parts, upper.long()))
+    whole = motion.points(points, keep_pieces_rigid(blended, motion.parts, upper.long()))
     alone = replace(graph, indices=torch.where(upper, above, below)[:, None])
     torch.testing.assert_close(whole, motion.points(points, alone), atol=1e-6, rtol=0)
     assert not torch.allclose(whole, motion.points(points, blended), atol=0.01)
@@ -126,6 +126,6 @@ def test_pieces_nearly_of_one_part_move_with_it_alone(points: torch.Tensor) -> N
 
 def test_pieces_of_several_parts_bend_as_before(points: torch.Tensor) -> None:
     graph = grid_graph(points)
-    kept = keep_pieces_whole(graph, lid(graph).parts, torch.zeros(len(points), dtype=torch.long))
+    kept = keep_pieces_rigid(graph, lid(graph).parts, torch.zeros(len(points), dtype=torch.long))
     assert torch.equal(kept.indices, graph.indices)
     assert torch.equal(kept.weights, graph.weights)

@@ -1,12 +1,17 @@
 import pytest
 
-from dg4d_lib.fitting.schedules import log_linear, reference_size_at, resolution_at
+from dg4d_lib.fitting.schedules import late_decay, log_linear, reference_size_at, resolution_at
 from dg4d_lib.settings import RESOLUTION_SCHEDULE, MotionSettings, ResolutionStage
 
 
 @pytest.mark.parametrize(("step", "rate"), [(1, 0.0099221), (100, 0.0045731), (250, 0.0014142), (500, 0.0002)])
 def test_mean_rates_of_the_method(step: int, rate: float):
     assert log_linear(0.01, 0.0002, step / 500) == pytest.approx(rate, rel=1e-4)
+
+
+@pytest.mark.parametrize(("progress", "factor"), [(0.0, 1.0), (0.5, 1.0), (0.75, 0.1), (1.0, 0.01)])
+def test_late_decay_keeps_rates_for_half_of_the_iterations(progress: float, factor: float):
+    assert late_decay(0.01, progress) == pytest.approx(factor)
 
 
 @pytest.mark.parametrize(

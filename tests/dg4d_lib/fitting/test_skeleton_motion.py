@@ -83,7 +83,7 @@ def test_a_child_turns_about_its_joint_and_follows_its_parent():
     _, joints = prepared()
     variables = turned([math.pi / 2])
     variables.turns[0, 1, 2] = 2.0  # the upper arm, by 90 degrees, too
-    variables.whole_depth[0] = 0.1
+    variables.global_depth[0] = 0.1
     motion = JointChains(joints).motion(variables)
     tip, middle = torch.tensor([[0.4, 0.0, 0.0], [-0.2, 0.0, 0.0]])
     graph = replace(joints.graph, indices=torch.tensor([[2], [1]]), weights=torch.ones(2, 1))
@@ -140,7 +140,7 @@ def test_a_pose_far_from_rest_is_found_and_corrects_the_placement(angle):
     surface, joints = prepared()
     seen = joints.of(surface.nearest)
     truth = turned([angle])
-    truth.whole_shift[0], truth.whole_depth[0] = torch.tensor([0.02, -0.01]), 0.1
+    truth.global_shift[0], truth.global_depth[0] = torch.tensor([0.02, -0.01]), 0.1
     video = drawn(surface.cloud, seen, truth)
     subject = torch.cat([video.frames[0], video.alpha[0]], -1)
     placement = Placement(torch.tensor([1.0, 0, 0, 0]), 1.0, torch.zeros(3), agreement=0.3)

@@ -82,6 +82,18 @@ def test_the_cloud_grows_where_the_picture_pulls_and_keeps_its_limit(known, stat
     assert 100 < len(grown) <= 130
 
 
+def test_a_larger_start_is_thinned_to_the_limit(known, static_settings):
+    limited = static_settings.model_copy(update={"iterations": 0, "max_points": 100})
+    start = blob(300, 0.3, seed())
+    start.opacity_logits[::5] += 1
+    fitted = fit_gaussians(start, known.subject(), known.prior(0.98), known.rasterize, limited, seed())
+    assert len(fitted) == 100
+    assert int((fitted.opacity_logits == start.opacity_logits.max()).sum()) == 60
+    assert fitted.means[:, 0].mean().abs() < 0.1  # not the first of the others, which may lie on one side
+    same = fit_gaussians(start, known.subject(), known.prior(0.98), known.rasterize, limited, seed())
+    assert torch.equal(fitted.means, same.means)
+
+
 def test_a_loss_that_is_no_number_stops_with_step_iteration_and_the_last_good_state(known, static_settings):
     class Broken:
         viewpoints, frames = None, None

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -36,6 +38,19 @@ def test_large_gaussians_split_into_two_smaller_ones():
     assert (result.gaussians.means[1] - result.gaussians.means[2]).norm() > 0
 
 
+def test_the_halves_of_a_flat_gaussian_stay_in_its_plane():
+    """A disk whose normal, its own z axis, is the x axis of the world: the turn takes x to y, y to z and z to x."""
+    disk = replace(
+        cloud([0.1] * 8),
+        log_scales=torch.tensor([0.1, 0.1, 1e-12]).log().expand(8, 3),
+        quats=torch.full((8, 4), 0.5),
+    )
+    result = densify(disk, torch.ones(8), 0.05, 0.05, 100, torch.Generator().manual_seed(0))
+    moved = result.gaussians.means - disk.means[result.source]
+    assert moved[:, 0].abs().max() < 1e-6
+    assert moved[:, 1:].abs().max(0).values.gt(0.05).all()
+
+
 def test_growth_keeps_to_its_room_and_prefers_the_strongest_pull():
     assert grown([0.01, 0.01, 0.01], [0.1, 0.9, 0.5], room=1).source.tolist() == [0, 1, 2, 1]
     assert grown([0.01], [1.0], room=0).source.tolist() == [0]
@@ -57,3 +72,9 @@ def test_screen_gradients_are_averaged_over_the_views_that_saw_them():
     pixel = torch.tensor([[[3.0, 4.0], [1.0, 0.0]], [[0.0, 0.0], [9.0, 9.0]]])
     gradients.add(pixel, torch.tensor([[True, True], [True, False]]), size=128)
     torch.testing.assert_close(gradients.mean, torch.tensor([5.0 * 64 / 2, 64.0]))
+
+
+def test_a_gaussian_that_no_view_saw_has_no_screen_gradient():
+    gradients = Grad2dStats.zeros(1)
+    gradients.add(torch.ones(1, 1, 2), torch.tensor([[False]]), size=128)
+    assert gradients.mean.tolist() == [0.0]

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from dg4d_lib.gaussians.initialize import blob, on_surface
@@ -19,8 +20,18 @@ def test_surface_points_cover_their_area():
     torch.testing.assert_close(cloud.scales, torch.full((100, 3), 0.2))
     torch.testing.assert_close(cloud.colors, points)
     torch.testing.assert_close(cloud.means, points)
+    torch.testing.assert_close(cloud.opacities, torch.full((100,), 0.9))
 
 
 def test_coincident_points_still_have_a_size():
     cloud = on_surface(torch.zeros(5, 3), torch.zeros(5, 3), area=0.0)
     assert torch.isfinite(cloud.log_scales).all()
+    cloud = blob(5, 0.0, torch.Generator().manual_seed(0))
+    assert torch.isfinite(cloud.log_scales).all()
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_fewer_gaussians_than_neighbors_have_the_distance_of_those_there_are(count: int):
+    cloud = blob(count, 0.5, torch.Generator().manual_seed(0))
+    between = torch.cdist(cloud.means, cloud.means).square().sum(1) / (count - 1)
+    torch.testing.assert_close(cloud.scales[:, 0], between.sqrt())

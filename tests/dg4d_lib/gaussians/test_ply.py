@@ -103,6 +103,30 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
     assert back.quats[0].tolist() == [3, 2, 1, 0]
 
 
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize("signed", [True, False])
+@pytest.mark.parametrize("short", [True, False])
+def test_columns_of_any_integer_type_are_skipped(tmp_path: Path, bits: int, signed: bool, short: bool) -> None:
+    prefix = "" if signed else "u"
+    written = prefix + ({8: "char", 16: "short", 32: "int"}[bits] if short else f"int{bits}")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty {written} label\n"
+    header += "".join(f"property float {name}\n" for name in COLUMNS) + "end_header\n"
+    rows = np.zeros(2, np.dtype([("label", f"u{bits // 8}"), *((name, "<f4") for name in COLUMNS)]))
+    rows["x"] = (1, 2)
+    (tmp_path / "a.ply").write_bytes(header.encode() + rows.tobytes())
+    assert read_ply(tmp_path / "a.ply").means[:, 0].tolist() == [1, 2]
+
+
+def test_faces_after_the_gaussians_are_not_read(tmp_path: Path) -> None:
+    """Properties that follow a list belong to its element, not to the one before it."""
+    path, faces = tmp_path / "a.ply", b"element face 1\nproperty list uchar int vertex_indices\nproperty int flags\n"
+    write_ply(path, cloud())
+    content = path.read_bytes().replace(b"end_header\n", faces + b"end_header\n")
+    path.write_bytes(content + np.array([3], "u1").tobytes() + np.arange(4, dtype="<i4").tobytes())
+    for back, given in zip(fields(read_ply(path)), fields(cloud()), strict=True):
+        assert torch.equal(back, given)
+
+
 @pytest.mark.parametrize(
     ("damage", "says"),
     [

@@ -7,7 +7,7 @@ import torch
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.errors import BadInput
 from dg4d_lib.gaussians.cloud import Gaussians
-from dg4d_lib.gaussians.transform import concatenate, transform
+from dg4d_lib.gaussians.transform import concatenate, thinned, transform
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.reference import rasterize
 
@@ -60,7 +60,15 @@ def test_joined_clouds_keep_their_gaussians_in_order() -> None:
     assert torch.equal(both.harmonics[:3], first.harmonics)
 
 
+def test_a_thinned_cloud_covers_the_area_of_the_whole() -> None:
+    """Four times fewer Gaussians of twice the size: the sum of the squared scales stays."""
+    whole = replace(random_cloud().at(0), log_scales=torch.full((12, 3), -2.5))
+    thin = thinned(whole, 4)
+    assert torch.equal(thin.means, whole.means[[0, 4, 8]])
+    torch.testing.assert_close(thin.scales.square().sum(0), whole.scales.square().sum(0))
+
+
 def test_colors_that_depend_on_the_view_cannot_be_turned() -> None:
     cloud = replace(random_cloud(), harmonics=torch.zeros(12, 4, 3))
-    with pytest.raises(BadInput, match="degree 0"):
+    with pytest.raises(BadInput, match=r"degree 0.*; given degree 1"):
         transform(cloud, STILL, 1.0, HERE)

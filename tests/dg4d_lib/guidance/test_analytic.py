@@ -3,11 +3,12 @@ import torch
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.diffusion.noise_schedule import alphas_cumprod
-from dg4d_lib.guidance.analytic import LATENT_NUMBERS, AnalyticPrior
+from dg4d_lib.guidance.analytic import AnalyticPrior
 from dg4d_lib.guidance.distillation import TimestepSchedule, annealed_timestep, distillation_loss
 from dg4d_lib.guidance.interface import GuidancePrior, GuidanceView
 
 SIZE = 12
+LATENT_NUMBERS = 4 * 32 * 32  # of Zero-1-to-3
 VIEWS = [GuidanceView(OrbitCamera(width=SIZE, height=SIZE))] * 3
 
 

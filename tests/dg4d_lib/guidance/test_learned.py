@@ -1,5 +1,7 @@
 """Expected views by the shape prior, behind the interface that the inflation has."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny_shape_prior import tiny_network
@@ -9,7 +11,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.guidance.interface import GuidanceView, SubjectShapes
 from dg4d_lib.guidance.learned import LearnedShapes
 from dg4d_lib.settings import LearnedPriorSettings
-from dg4d_lib.shape_prior.field import ShapeFields
+from dg4d_lib.shape_prior.field import ShapeField, ShapeFields
 
 SIZE = 48
 SETTINGS = LearnedPriorSettings(depth_sigma=0)
@@ -47,9 +49,14 @@ def test_views_do_not_depend_on_their_neighbors(settings):
         assert torch.equal(alone[0], color[i]) and torch.equal(cover[0], alpha[i])
 
 
-def test_pictures_have_the_size_of_their_camera():
-    for height, width in ((33, 33), (128, 128), (512, 512), (64, 40)):
-        color, alpha = shapes(24).clean([GuidanceView(OrbitCamera(0, 30, width=width, height=height))])
+@pytest.mark.parametrize(
+    ("settings", "sizes"), [(SETTINGS, ((33, 33), (128, 128), (512, 512), (64, 40))), (AVERAGES, ((64, 40),))]
+)
+def test_pictures_have_the_size_of_their_camera(settings, sizes):
+    for height, width in sizes:
+        color, alpha = shapes(24, settings=settings).clean(
+            [GuidanceView(OrbitCamera(0, 30, width=width, height=height))]
+        )
         assert color.shape == (1, height, width, 3) and alpha.shape == (1, height, width, 1)
         assert ((color >= 0) & (color <= 1)).all() and ((alpha >= 0) & (alpha <= 1)).all()
 
@@ -65,6 +72,21 @@ def test_unsure_depth_blurs_the_side_and_not_the_front():
 def test_the_surface_of_a_frame_lies_where_the_frame_shows_it():
     surface = shapes(16, 32).surface(1)
     assert surface.vertices[:, 0].mean() > 0.1 and surface.colors.max() <= 1
+
+
+class PartlyInflated(ShapeFields):
+    """Fields that take a certain share from the inflation in every frame."""
+
+    def predict(self, frame: int) -> ShapeField:
+        return replace(super().predict(frame), inflated_share=(0.2, 0.9, 0.6)[frame])
+
+
+def test_the_share_of_the_inflation_is_the_mean_over_the_frames_asked_for():
+    found = LearnedShapes(PartlyInflated(tiny_network(), [disc(x) for x in (16, 24, 32)]), SETTINGS)
+    assert found.inflated_share == 0
+    for frame in (0, 2, 0):
+        found.surface(frame)
+    assert found.inflated_share == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("frame", [-1, 1])

@@ -76,6 +76,15 @@ def test_gains_differ_between_views_and_frames_and_spare_the_outline():
     assert torch.equal(spoiled(color_gain=0.1).pictures[..., 3], spotted().pictures[..., 3])
 
 
+def test_brighter_than_white_is_white_under_any_gain():
+    """Of 250 and 5: gains of at least 1.02 make 255 of the first, others keep the order of the two."""
+    pictures = torch.full((2, 3, 2, 2, 4), 255, dtype=torch.uint8)
+    pictures[..., :3] = torch.tensor([[250], [5]], dtype=torch.uint8)
+    tinted = perturb(Bank(CAMERAS, (0, 1, 2), pictures), OraclePriorSettings(color_gain=0.5), torch.Generator())
+    bright, dark = tinted.pictures[..., 0, :3], tinted.pictures[..., 1, :3]
+    assert (bright == 255).any() and (bright > dark).all()
+
+
 def test_shifts_differ_between_views_and_frames_and_keep_what_is_seen():
     alpha = spoiled(shift=2.0).pictures[..., 3].double()
     rows, columns = alpha.sum(-1), alpha.sum(-2)

@@ -4,7 +4,6 @@ import logging
 from pathlib import Path
 
 import pytest
-from numba import njit
 
 from dg4d_lib.kernels import compiling
 from dg4d_lib.mesh import folds
@@ -60,7 +59,7 @@ def test_the_stamp_of_folds_covers_the_rotations_that_they_inline():
 
 
 def test_kernels_use_our_cache_locators():
-    kernel = njit(cache=True)(lambda: None)
+    kernel = compiling.njit(cache=True)(lambda: None)
     assert isinstance(kernel._cache._impl.locator, compiling._SourceDigest)
 
 
@@ -73,8 +72,7 @@ def test_compiling_is_logged_once(caplog):
 
 
 def test_a_compilation_reaches_one_listener(monkeypatch):
-    compiling.configure_numba()  # as every module with kernels does
     events = []
     monkeypatch.setattr(compiling._CompileNotice, "on_start", lambda notice, event: events.append(event))
-    njit(lambda: 1)()
+    compiling.njit()(lambda: 1)()
     assert events and len(events) == len(set(map(id, events)))

@@ -8,7 +8,7 @@ from torch.nn.functional import max_pool2d
 
 from dg4d_lib.gaussians.cloud import Gaussians
 from dg4d_lib.geometry.normals import vertex_normals
-from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, drawn_gaussians, locate_texels
+from dg4d_lib.mesh.texturing.bake import PosedSurface, bake_texture, gaussian_renderer, locate_texels
 from dg4d_lib.mesh.texturing.unwrap import unwrap
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.settings import MeshSettings
@@ -43,7 +43,7 @@ def baked(sphere: Mesh, sphere_of_gaussians: Cloud) -> tuple[torch.Tensor, ...]:
     vertices = np.concatenate([sphere[0], 0.6 * sphere[0]])
     mesh = flattened(vertices, np.concatenate([sphere[1], sphere[1] + len(sphere[0])]))
     gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
-    texture = bake_texture(*mesh, drawn_gaussians(gaussians, get_rasterizer("auto")), SETTINGS)
+    texture = bake_texture(*mesh, gaussian_renderer(gaussians, get_rasterizer("auto")), SETTINGS)
     texels = locate_texels(*mesh, SETTINGS.texture_size)
     where = torch.stack([texels.rows, texels.columns])
     return texture[texels.rows, texels.columns], texels.positions, texture, where
@@ -105,7 +105,7 @@ def test_footage_colors_what_it_shows_where_the_surface_was(sphere: Mesh, sphere
     footage = PosedSurface(vertices @ turned, normals @ turned, *green_frame(1.0))
     gaussians = sphere_of_gaussians(2500, 0.5, red_and_blue)
     texture = bake_texture(
-        vertices, normals, faces, uvs, drawn_gaussians(gaussians, get_rasterizer("auto")), SETTINGS, [footage]
+        vertices, normals, faces, uvs, gaussian_renderer(gaussians, get_rasterizer("auto")), SETTINGS, [footage]
     )
     texels = locate_texels(vertices, normals, faces, uvs, SETTINGS.texture_size)
     colors = texture[texels.rows, texels.columns]
@@ -120,7 +120,9 @@ def test_footage_is_averaged_by_weight(sphere: Mesh, sphere_of_gaussians: Cloud)
     mesh = flattened(*sphere)
     green, alpha = green_frame(1.0)
     footage = [PosedSurface(*mesh[:2], green, alpha, 3.0), PosedSurface(*mesh[:2], torch.zeros_like(green), alpha)]
-    texture = bake_texture(*mesh, drawn_gaussians(sphere_of_gaussians(600), get_rasterizer("auto")), SETTINGS, footage)
+    texture = bake_texture(
+        *mesh, gaussian_renderer(sphere_of_gaussians(600), get_rasterizer("auto")), SETTINGS, footage
+    )
     texels = locate_texels(*mesh, SETTINGS.texture_size)
     shown = texels.normals[:, 2] > 0.85
     assert shown.sum() > 300
@@ -137,7 +139,7 @@ def test_footage_fades_out_within_a_pixel_of_its_outline(sphere: Mesh, sphere_of
         PosedSurface(vertices, normals, green, left),
         PosedSurface(vertices, normals, torch.zeros_like(green), whole),
     ]
-    draw = drawn_gaussians(sphere_of_gaussians(600), get_rasterizer("auto"))
+    draw = gaussian_renderer(sphere_of_gaussians(600), get_rasterizer("auto"))
     texture = bake_texture(vertices, normals, corners, uvs, draw, settings, footage)
     texels = locate_texels(vertices, normals, corners, uvs, settings.texture_size)
     shown = torch.zeros(texture.shape[:2], dtype=torch.bool)
@@ -152,7 +154,7 @@ def test_footage_fades_out_within_a_pixel_of_its_outline(sphere: Mesh, sphere_of
 def test_transparent_footage_changes_nothing(sphere: Mesh, sphere_of_gaussians: Cloud) -> None:
     mesh, gaussians = flattened(*sphere), sphere_of_gaussians(600, 0.5, red_and_blue)
     nothing = PosedSurface(*mesh[:2], *green_frame(0.0))
-    draw = drawn_gaussians(gaussians, get_rasterizer("auto"))
+    draw = gaussian_renderer(gaussians, get_rasterizer("auto"))
     textures = [bake_texture(*mesh, draw, SETTINGS, given) for given in ((), [nothing])]
     assert (textures[0] - textures[1]).abs().mean() < 0.01  # the front then comes from oblique views
 
@@ -162,7 +164,7 @@ def test_a_transparent_cloud_leaves_the_texture_gray(sphere: Mesh, sphere_of_gau
     faint = Gaussians(
         gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits - 9, gaussians.harmonics
     )
-    texture = bake_texture(*flattened(*sphere), drawn_gaussians(faint, get_rasterizer("auto")), SETTINGS)
+    texture = bake_texture(*flattened(*sphere), gaussian_renderer(faint, get_rasterizer("auto")), SETTINGS)
     assert (texture == 0.5).all()
 
 

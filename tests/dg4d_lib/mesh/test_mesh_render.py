@@ -7,7 +7,7 @@ import trimesh
 
 from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.mesh import render
-from dg4d_lib.mesh.render import LitRenderer, render_lit, render_mesh
+from dg4d_lib.mesh.render import LitRenderer, render_mesh
 from dg4d_lib.mesh.textured import TexturedMesh
 
 SIZE = 32
@@ -96,7 +96,7 @@ def test_kernels_draw_what_operators_with_gradients_draw(height: int, width: int
     for supersampling in (1, 3):
         drawn = render_mesh(mesh, cameras, supersampling=supersampling)
         expected = render_mesh(graded, cameras, supersampling=supersampling)
-        lit, lit_expected = (render_lit(one, cameras[0], supersampling) for one in (mesh, graded))
+        lit, lit_expected = (LitRenderer(supersampling).render(one, cameras[0]) for one in (mesh, graded))
         for one, other in zip((*drawn, *lit), (*expected, *lit_expected), strict=True):
             assert one.max() > 0.1
             torch.testing.assert_close(one, other.detach(), atol=2e-5, rtol=0)
@@ -123,7 +123,7 @@ def test_a_moving_mesh_is_prepared_once_and_drawn_as_afresh(
     bend[5], opening[3:] = torch.tensor([0.0, 0.0, 0.2]), torch.tensor([0.1, 0.0, 0.3])
     states = [replace(split, vertices=split.vertices + share * bend) for share in (0, 1, 2)]
     states += [replace(split, vertices=split.vertices + opening), replace(split, texture=1 - split.texture)]
-    expected = [render_lit(state, CAMERA) for state in states]
+    expected = [LitRenderer().render(state, CAMERA) for state in states]
     calls: list[str] = []
     for name in ("group_vertices", "mip_levels"):
         function = getattr(render, name)
@@ -140,6 +140,7 @@ def test_light_leaves_no_dark_border() -> None:
     ball = trimesh.creation.icosphere(4, 0.5)
     vertices = torch.from_numpy(ball.vertices).float()
     faces, uvs = torch.from_numpy(ball.faces).int(), torch.full((len(vertices), 2), 0.5)
-    color, alpha = render_lit(TexturedMesh(vertices, faces, uvs, torch.ones(4, 4, 3)), replace(CAMERA, elevation_deg=5))
+    mesh = TexturedMesh(vertices, faces, uvs, torch.ones(4, 4, 3))
+    color, alpha = LitRenderer().render(mesh, replace(CAMERA, elevation_deg=5))
     upper_left = (color * alpha + 0.6 * (1 - alpha))[: SIZE // 2, : SIZE // 2]
     assert alpha[: SIZE // 2, : SIZE // 2].max() == 1 and upper_left.min() > 0.59

@@ -35,9 +35,8 @@ def test_vertices_that_were_left_behind_come_to_the_outlines_and_others_stay():
     vertices, faces = (torch.from_numpy(a) for a in extract_surface(density_field(rest, SETTINGS), LEVEL))
     nothing = torch.zeros(2, len(vertices), 3)
     outlines = render_silhouettes(states, [0, 1], rasterize)
-    offsets, agreed = register_nonrigid(vertices, nothing, faces, states, outlines, LEVEL, SETTINGS)
+    offsets = register_nonrigid(vertices, nothing, faces, states, outlines, LEVEL, SETTINGS)
     before, after = (silhouette_iou(vertices + offset, faces, outlines) for offset in (nothing, offsets))
-    torch.testing.assert_close(after, agreed)
     assert before[0] > MIN_IOU > before[1]
     assert torch.equal(offsets[0], nothing[0])
     assert before[1] < 0.65

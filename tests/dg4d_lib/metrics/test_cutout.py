@@ -43,6 +43,25 @@ def test_a_cutout_that_covers_most_of_the_border_is_background():
     assert "cut-out border" in failing(mask)
 
 
+def test_the_border_is_a_hundredth_of_the_longest_side_wide():
+    mask = np.zeros((100, 300), bool)
+    mask[3:-3, 3:-3] = True
+    assert (border_share(mask), border_share(~mask)) == (0, 1)
+    mask[2, 2] = True  # on the third line from the edge
+    assert border_share(mask) == pytest.approx(1 / (100 * 300 - 94 * 294))
+    tiny = np.zeros((9, 9), bool)
+    tiny[0] = True  # a hundredth of nine pixels is at least one pixel
+    assert border_share(tiny) == 9 / 32
+
+
+def test_pixels_belong_to_the_cutout_from_half_of_their_alpha():
+    alpha = torch.from_numpy(square())[None].float()
+    alpha[0, 90:100] = 0.49
+    assert evaluate_cutout(alpha, None, CutoutGateSettings())[0].value == 0
+    alpha[0, 90:100] = 0.51
+    assert evaluate_cutout(alpha, None, CutoutGateSettings())[0].value == pytest.approx(1000 / 4600)
+
+
 def test_two_methods_that_disagree_fail_and_a_single_one_is_not_judged():
     assert failing(square(), 0.4) == ["cut-out agreement"]
     gates = evaluate_cutout(torch.from_numpy(square())[None].float(), None, CutoutGateSettings())

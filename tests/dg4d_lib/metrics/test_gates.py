@@ -140,6 +140,13 @@ def test_a_band_is_left_on_either_side() -> None:
     assert replace(gate, values={"splats": 0.7, "mesh": 5.0}).form == "mesh"
 
 
+@pytest.mark.parametrize(("least", "most"), [(0.6, 1.7), (0.6, None), (None, 1.7), (None, None)])
+def test_a_value_lies_on_a_side_only_where_there_is_a_bound(least: float | None, most: float | None) -> None:
+    gate = Gate("motion", {"splats": 1.0}, least, most, "", "")
+    sides = ["" if least is None else "low", "", "", "", "" if most is None else "high"]
+    assert [gate.side(value) for value in (0.1, 0.6, 1.0, 1.7, 5.0)] == sides
+
+
 def test_fidelity_looks_at_the_subject_only() -> None:
     dark = RgbaImages(disk().color - 0.1 * disk().alpha, disk().alpha)
     assert fidelity(dark, disk()).item() == pytest.approx(20, abs=1e-3)  # 0.1 off everywhere on the subject
@@ -221,6 +228,11 @@ def test_blur_and_noise_are_told_by_sharpness() -> None:
     assert with_color(truth.color) == 1
     assert with_color(blurred) < 0.8
     assert with_color(truth.color + 0.2 * noise) > 1.3
+
+
+def test_half_the_contrast_is_half_as_sharp() -> None:
+    truth = disk(radius=0.8)
+    assert sharpness(replace(truth, color=0.5 + (truth.color - 0.5) / 2), truth) == pytest.approx(0.5, rel=0.02)
 
 
 def test_a_plain_subject_is_as_sharp_as_can_be() -> None:

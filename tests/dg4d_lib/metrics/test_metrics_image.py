@@ -49,7 +49,7 @@ def test_integers_are_refused() -> None:
 
 def test_iou_of_two_shifted_squares() -> None:
     first, second = torch.zeros(1, 8, 8, 1), torch.zeros(1, 8, 8, 1)
-    first[:, 0:4, 0:4], second[:, 0:4, 2:6] = 0.9, 0.6
+    first[:, 0:4, 0:4], second[:, 0:4, 2:6] = 0.9, 0.51
     assert iou(first, second).item() == pytest.approx(8 / 24)
 
 

@@ -30,25 +30,36 @@ def picture() -> torch.Tensor:
     return torch.cat([torch.rand(2, 3, SIZE, SIZE) * alpha, alpha], 1)
 
 
+def whole_picture(
+    network: ShapePriorNetwork, picture: torch.Tensor, code: torch.Tensor | None = None
+) -> tuple[torch.Tensor, ...]:
+    """Return occupancy, colors and their scale on all rays, by batch, row and column."""
+    features = network.encode(picture)
+    found = network.rays(network.decode(features, code), features.picture, torch.arange(len(picture) * SIZE**2))
+    return tuple(part.unflatten(0, (-1, SIZE, SIZE)) for part in found)
+
+
 def test_every_ray_gets_occupancy_colors_and_a_scale(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
-    found = network(picture)
-    assert found.occupancy.shape == (2, BINS, SIZE, SIZE)
-    assert found.colors.shape == (2, KNOTS, 3, SIZE, SIZE)
-    assert ((found.colors >= 0) & (found.colors <= 1)).all()
-    assert (found.color_scale > 0).all()
-    assert torch.equal(found.mirror_moment, found.mirror_moment.transpose(1, 2))
+    occupancy, colors, scale = whole_picture(network, picture)
+    assert occupancy.shape == (2, SIZE, SIZE, BINS)
+    assert colors.shape == (2, SIZE, SIZE, KNOTS, 3)
+    assert ((colors >= 0) & (colors <= 1)).all()
+    assert (scale > 0).all()
+
+
+def test_the_moment_of_the_mirror_plane_is_symmetric(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
+    moment, _, _ = network.mirror(network.encode(picture).code)
+    assert torch.equal(moment, moment.transpose(1, 2))
 
 
 def test_chosen_rays_are_the_same_as_in_the_whole_picture(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
     places = [(0, 31, 42), (1, 64, 64), (1, 55, 41), (0, 80, 69)]
     pixels = torch.tensor([(batch * SIZE + row) * SIZE + column for batch, row, column in places])
     features = network.encode(picture)
-    occupancy, colors, scale = network.rays(network.decode(features), features.picture, pixels)
-    whole = network(picture)
-    for i, (batch, row, column) in enumerate(places):
-        torch.testing.assert_close(occupancy[i], whole.occupancy[batch, :, row, column])
-        torch.testing.assert_close(colors[i], whole.colors[batch, :, :, row, column])
-        torch.testing.assert_close(scale[i], whole.color_scale[batch, :, row, column])
+    chosen = network.rays(network.decode(features), features.picture, pixels)
+    for some, every in zip(chosen, whole_picture(network, picture), strict=True):
+        for ray, place in zip(some, places, strict=True):
+            torch.testing.assert_close(ray, every[place])
 
 
 def test_rays_read_features_as_linear_interpolation_does(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
@@ -66,10 +77,11 @@ def test_rays_read_features_as_linear_interpolation_does(network: ShapePriorNetw
 
 def test_frames_can_share_the_code_of_their_subject(network: ShapePriorNetwork, picture: torch.Tensor) -> None:
     code = network.encode(picture).code.mean(0, keepdim=True).expand(2, -1)
-    shared = network(picture, code)
-    assert torch.equal(shared.mirror_moment[0], shared.mirror_moment[1])
-    assert not torch.equal(shared.occupancy[0], shared.occupancy[1])
-    assert not torch.allclose(shared.occupancy, network(picture).occupancy)
+    moment, _, _ = network.mirror(code)
+    assert torch.equal(moment[0], moment[1])
+    shared, _, _ = whole_picture(network, picture, code)
+    assert not torch.equal(shared[0], shared[1])
+    assert not torch.allclose(shared, whole_picture(network, picture)[0])
 
 
 def test_coordinates_inside_the_subject_run_from_minus_one_to_one() -> None:
@@ -83,7 +95,8 @@ def test_coordinates_inside_the_subject_run_from_minus_one_to_one() -> None:
 
 
 def test_an_empty_picture_gives_finite_numbers(network: ShapePriorNetwork) -> None:
-    assert network(torch.zeros(1, 4, SIZE, SIZE)).occupancy.isfinite().all()
+    occupancy, _, _ = whole_picture(network, torch.zeros(1, 4, SIZE, SIZE))
+    assert occupancy.isfinite().all()
 
 
 def test_weights_survive_their_file(network: ShapePriorNetwork, picture: torch.Tensor, tmp_path: Path) -> None:
@@ -91,7 +104,8 @@ def test_weights_survive_their_file(network: ShapePriorNetwork, picture: torch.T
     again = load_network(tmp_path / "n.safetensors")
     assert again.config == TINY
     # float16 keeps eleven bits
-    torch.testing.assert_close(again(picture).occupancy, network(picture).occupancy, rtol=0.02, atol=0.02)
+    stored, exact = (whole_picture(made, picture)[0] for made in (again, network))
+    torch.testing.assert_close(stored, exact, rtol=0.02, atol=0.02)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

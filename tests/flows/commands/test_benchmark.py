@@ -16,7 +16,7 @@ from waiting import retry_after
 
 from dg4d_lib.errors import BadInput
 from flows import cli
-from flows.commands.benchmark import bench, put_truth, score
+from flows.commands.benchmark import bench, compute_seconds, frame_limit, put_ground_truth, request_of, score
 from flows.packages.scores import Results
 from flows.serving.server import Server
 from flows.step_errors import StepError, StepMissing
@@ -146,6 +146,11 @@ def test_true_views_are_the_prior_where_the_bank_is_asked_for(tmp_path: Path) ->
     (folder / "bank" / "a.png").write_bytes(PNG)
     results = run(tmp_path / "data", tmp_path / "out", bank=True)
     assert results.settings["changes"] == {"prior.kind": "oracle"}
+    for i in range(2, 4):
+        for name in ("input", *VIEWS):
+            (folder / name / f"{i:03d}.png").write_bytes(PNG)
+    with pytest.raises(BadInput, match=r"only 3 frames would be used \(subject\.max_frames\): newt"):
+        run(tmp_path / "data", tmp_path / "out", bank=True, changes=["subject.max_frames=3"])
     record = json.loads((tmp_path / "out" / "assets" / "newt" / "provenance.json").read_text())
     (fit,) = [step for step in record["steps"] if step["step"] == "fit_gaussians"]
     assert fit["settings"]["prior"]["kind"] == "oracle"
@@ -180,9 +185,9 @@ def test_a_finished_asset_takes_no_knobs_of_the_conversion(tmp_path: Path) -> No
 def test_equal_truths_are_one_artifact_whatever_their_files_are_called(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path / "store")
     first, second = thing(tmp_path / "1" / "newt", "x"), thing(tmp_path / "2" / "newt", "x", "{}.png")
-    assert put_truth(find_ground_truth(first), store) == put_truth(find_ground_truth(second), store)
+    assert put_ground_truth(find_ground_truth(first), store) == put_ground_truth(find_ground_truth(second), store)
     (second / VIEWS[0] / "0.png").write_text(picture("another picture"))
-    assert put_truth(find_ground_truth(first), store) != put_truth(find_ground_truth(second), store)
+    assert put_ground_truth(find_ground_truth(first), store) != put_ground_truth(find_ground_truth(second), store)
 
 
 def test_a_truth_that_cannot_be_judged_against_is_bad_input_and_no_table_is_written(tmp_path: Path) -> None:
@@ -215,3 +220,54 @@ def test_the_exit_status_says_whether_every_object_has_scores(
     for name, said in words.items():
         assert (f"failed: {name}: " in result.output) == ("=" in said)
     assert ("PSNR, dB" in result.output) == ("well" in words.values())
+
+
+@pytest.mark.parametrize(
+    ("frames", "views", "changes", "framing"),
+    [
+        (2, (), {}, "keep"),
+        (1, VIEWS, {}, "keep"),
+        (1, (), {}, "auto"),
+        (2, VIEWS, {"subject.framing": "center"}, "center"),
+    ],
+)
+def test_frames_with_a_known_camera_are_used_uncropped(
+    tmp_path: Path, frames: int, views: tuple[str, ...], changes: dict[str, str], framing: str
+) -> None:
+    for name in ("input", *views):
+        (tmp_path / "newt" / name).mkdir(parents=True)
+        for i in range(frames):
+            (tmp_path / "newt" / name / f"{i}.png").write_bytes(PNG)
+    request = request_of(find_ground_truth(tmp_path / "newt"), False, changes, "preview", 0)
+    assert request.settings.subject.framing == framing
+
+
+def test_a_benchmark_in_which_every_object_fails_says_why(tmp_path: Path) -> None:
+    thing(tmp_path / "data" / "ill", "fit_motion=bad:bent .")
+    results = run(tmp_path / "data", tmp_path / "out")
+    written = Results.model_validate_json((tmp_path / "out" / "results.json").read_text())
+    assert written == results and [one.error for one in written.failed] == ["the picture is bent"]
+
+
+@pytest.mark.parametrize(("mesh", "seconds"), [(False, 7.0), (True, 127.0)])
+def test_times_hold_what_is_scored_and_no_more(mesh: bool, seconds: float) -> None:
+    durations = {
+        "prepare_subject": 1,
+        "fit_gaussians": 2,
+        "fit_motion": 4,
+        "plan_mesh": 8,
+        "extract_mesh 1/2": 16,
+        "extract_mesh 2/2": 32,
+        "refine_texture": 64,
+        "pack_asset": 128,
+        "check_asset": 256,
+    }
+    steps = [{"step": step, "duration_s": duration} for step, duration in durations.items()]
+    assert compute_seconds({"run": {"steps": steps}}, mesh) == seconds
+
+
+@pytest.mark.parametrize(("port", "most"), [("footage", 16), ("subject", 0)])
+def test_the_score_knows_to_how_many_frames_a_video_was_sampled(port: str, most: int) -> None:
+    steps = [{"step": "prepare_subject", "outputs": {port: "sha256:0"}}]
+    recipe = {"settings": {"subject": {"max_frames": 16}}}
+    assert frame_limit({"steps": steps, "recipe": recipe}) == most

@@ -196,14 +196,14 @@ def test_a_watched_folder_reports_packages_and_failures_once(tmp_path: Path) -> 
         (out / name).mkdir(parents=True)
         (out / name / "provenance.json").write_text("{}")
     watched = WatchedResults(out)
-    assert watched.look() == []
+    assert watched.poll() == []
     (out / "deep/fox").mkdir(parents=True)
     (out / "deep/fox/provenance.json").write_text("{}")
     (out / "deep/fox/report.json").write_text(json.dumps({"acceptance": {"failing": ["flaws"]}}))
     failed = [{"item": "cat\x1b", "status": "failed", "message": "no subject"}, {"item": "fox", "status": "done"}]
     (out / "summary.json").write_text(json.dumps({"items": failed}))
-    assert watched.look() == [f"done: {out}/deep/fox (not accepted: flaws)", r"failed: cat\x1b: no subject"]
-    assert watched.look() == []
+    assert watched.poll() == [f"done: {out}/deep/fox (not accepted: flaws)", r"failed: cat\x1b: no subject"]
+    assert watched.poll() == []
     os.utime(out / "old" / "provenance.json", (1, 1))
     (out / "summary.json").write_text("torn")
-    assert watched.look() == [f"done: {out}/old"]
+    assert watched.poll() == [f"done: {out}/old"]

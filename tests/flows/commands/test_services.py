@@ -223,7 +223,7 @@ def test_a_watch_goes_on_while_the_server_is_away(
 
     monkeypatch.setattr(watching, "announce", announce)
     monkeypatch.setattr(showing, "revive", lambda: happened.append("revived"))
-    monkeypatch.setattr(watching.Watcher, "told", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(watching.Watcher, "mark_announced", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(typer.Exit):
         services.watch(inbox, inbox.parent / "out", 0.0)
     digest = happened[0]
@@ -294,7 +294,7 @@ def test_a_slow_server_does_not_count_as_rest(inbox: Path, monkeypatch: pytest.M
     monkeypatch.setattr(services.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(services, "RESULTS_EVERY_S", 0.0)
     monkeypatch.setattr(watching.FailedRuns, "_failed", failed_runs)
-    monkeypatch.setattr(watching.Watcher, "look", look)
+    monkeypatch.setattr(watching.Watcher, "poll", look)
     with pytest.raises(typer.Exit):
         services.watch(inbox, inbox.parent / "out", 10.0)
     assert looks == clock

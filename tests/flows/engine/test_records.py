@@ -24,9 +24,17 @@ def changed(content: dict[str, Any], serializer: dict[str, Any] | None = None) -
     return json.dumps(record)
 
 
+def with_setting(value: Any) -> dict[str, Any]:
+    """Return a sound result of a step that had this setting; settings may have any value of JSON."""
+    data = RESULT.model_dump(mode="json")
+    data["provenance"]["settings"] = {"a": value}
+    return data
+
+
 def test_results_of_steps_and_of_tasks_are_read() -> None:
     assert parse_record(record_of(RESULT)) == RESULT
     assert parse_record(record_of(Subject(**dict(RESULT)))) == RESULT
+    assert parse_record(changed({"data": with_setting([{"deep": 1}])})) is not None
 
 
 @pytest.mark.parametrize(
@@ -38,6 +46,8 @@ def test_results_of_steps_and_of_tasks_are_read() -> None:
         changed({"__exc_type__": "builtins.SystemExit", "message": "1"}),
         changed({"data": dict(RESULT.model_dump(mode="json"), outputs=OPENER)}),
         changed({"data": dict(RESULT.model_dump(mode="json"), outputs={"o": [OPENER]})}),
+        changed({"data": with_setting(OPENER)}),
+        changed({"data": with_setting([{"deep": OPENER}])}),
         changed({"data": {"__exc_type__": "builtins.SystemExit", "message": "1"}}),
         changed({}, PickleSerializer().model_dump()),
         changed({}, {"object_decoder": "os.system"}),

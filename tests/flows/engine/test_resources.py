@@ -14,6 +14,7 @@ import pytest
 from dg4d_lib.errors import BadInput
 from flows.engine import resources
 from flows.engine.resources import Resource, Stopped, Turn, resource_of, slot
+from flows.engine.turns import first_ahead, ticket
 from steps.contract import StepRequest
 
 HOLDER = """
@@ -261,6 +262,13 @@ def test_a_full_disk_keeps_no_slot_and_no_ticket(tmp_path: Path, monkeypatch: py
         assert waited_s < 5
 
 
+def test_a_ticket_without_a_name_is_ahead_as_well(tmp_path: Path) -> None:
+    with ticket(tmp_path, 1, "") as first, ticket(tmp_path, 2, "second") as second, ticket(tmp_path, 3, "") as third:
+        assert first_ahead(first) is None
+        assert first_ahead(second) == first_ahead(third) == first.stem
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_slots_and_queues_are_in_the_folder_that_the_variable_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,6 +288,40 @@ def test_slots_where_no_folder_can_be_are_refused(
     monkeypatch.setenv("DG4D_SLOTS", str(tmp_path / name))
     with pytest.raises(BadInput, match=rf"\$DG4D_SLOTS is .*{says}; set it to a folder"), slot("cpu", silent):
         pass
+
+
+def test_a_full_disk_is_not_called_a_wrong_folder_of_slots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, **_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setenv("DG4D_SLOTS", str(tmp_path / "slots"))
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(OSError, match="No space"), slot("cpu", silent):
+        pass
+
+
+def test_a_wait_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, free, reports, attempts = threading.Event(), threading.Event(), [], []
+
+    def hold() -> None:
+        with slot("cpu", silent):
+            held.set()
+            free.wait(60)
+
+    def counted(own: Path) -> str | None:
+        attempts.append(own)
+        if len(attempts) == 5:
+            free.set()
+        return first_ahead(own)
+
+    def wait() -> None:
+        held.wait(60)
+        monkeypatch.setattr(resources, "first_ahead", counted)
+        with slot("cpu", reports.append):
+            pass
+
+    all_at_once(hold, wait)
+    assert len(attempts) >= 5 and len(reports) == 1
 
 
 def test_slots_in_a_folder_of_somebody_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

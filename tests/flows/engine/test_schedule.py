@@ -91,6 +91,19 @@ def test_a_divided_step_ends_with_its_last_part() -> None:
     assert schedule.durations() == {"extract_mesh": 8.0}
 
 
+def test_steps_that_are_not_planned_do_not_count() -> None:
+    schedule = Schedule(["fit_motion"], {"fit_motion": 10.0})
+    run(schedule, "draw_picture", 0.0, 5.0)
+    assert (schedule.finished, schedule.durations(), schedule.position("draw_picture")) == (0, {}, "")
+    assert schedule.seconds_left(5.0) == pytest.approx(10.0)
+
+
+def test_a_step_of_no_known_length_may_report_progress() -> None:
+    schedule = Schedule(["fit_motion"], {"fit_motion": 10.0})
+    schedule.note(event("fit_motion", "progress", done=0, total=0), 0.0)
+    assert schedule.seconds_left(0.0) == pytest.approx(10.0)
+
+
 def test_durations_are_kept_by_profile_and_what_is_broken_is_ignored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -104,6 +117,14 @@ def test_durations_are_kept_by_profile_and_what_is_broken_is_ignored(
     durations_file().write_text('{"preview": {"fit_motion": "x", "plan_mesh": -1, "drive_video": NaN}, "paper": 3}')
     assert load_durations("preview") == load_durations("paper") == {}
     durations_file().write_text("torn")
+    assert load_durations("preview") == {}
+
+
+@pytest.mark.parametrize("broken", ['"x"', "-1", "1e999", "NaN", "true", "null"])
+def test_only_a_number_of_seconds_is_a_duration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    monkeypatch.setenv("DG4D_HOME", str(tmp_path))
+    keep_durations("preview", {"fit_motion": 30.0})
+    durations_file().write_text(durations_file().read_text().replace("30.0", broken))
     assert load_durations("preview") == {}
 
 

@@ -122,6 +122,14 @@ def test_what_was_written_since_the_oldest_run_began_stays(
         assert recent.digest in here(store)
 
 
+def test_a_lease_keeps_what_it_had_when_more_is_needed(store: ArtifactStore) -> None:
+    given, found = (store.put_bytes(name, "a/b") for name in (b"given", b"found"))
+    with leases.running(store, "cat", [given]):
+        leases.hold(store, "cat", [found.digest])
+        artifacts, _ = leases.needed(store, store.now())
+    assert artifacts == {given.digest, found.digest}
+
+
 def test_two_runs_of_one_item_share_a_lease(store: ArtifactStore) -> None:
     with leases.running(store, "cat"):
         with leases.running(store, "cat"):
@@ -196,6 +204,20 @@ def test_a_lock_of_another_machine_is_believed_as_long_as_it_gives_signs_of_life
     monkeypatch.setattr(leases, "LOCK_S", -1.0)
     collect(store, tmp_path / "results")
     assert list(store.entries("collecting")) == []
+
+
+def test_a_lock_that_is_half_written_is_believed_until_it_is_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = BucketStore(MemoryStore(), tmp_path / "copies", "memory")
+    store.write(leases.LOCK, '{"host": "else')
+    with pytest.raises(BadInput, match="another `dg4d store gc`"), leases.collecting(store):
+        pass
+    now = store.now()
+    monkeypatch.setattr(store, "now", lambda: now + leases.LOCK_S + 60)
+    with leases.collecting(store):
+        pass
+    assert store.read(leases.LOCK) is None
 
 
 def test_a_version_that_is_recorded_while_things_are_removed_is_whole_or_not_there(

@@ -8,7 +8,7 @@ import pytest
 from fake_steps import PNG, bank_json, picture
 
 from dg4d_lib.errors import BadInput
-from flows.commands.benchmark import put_truth
+from flows.commands.benchmark import put_ground_truth
 from flows.inputs import sources
 from flows.inputs.sources import put_bank, put_source
 from steps.artifacts.ground_truth import find_ground_truth
@@ -125,8 +125,8 @@ def test_a_secret_in_a_ground_truth_is_not_stored(tmp_path: Path, store: Artifac
     for folder in ("input", "view_15"):
         (tmp_path / "newt" / folder).mkdir(parents=True)
         (tmp_path / "newt" / folder / "0.png").write_text(picture(folder))
-    put_truth(find_ground_truth(tmp_path / "newt"), store)
+    put_ground_truth(find_ground_truth(tmp_path / "newt"), store)
     (tmp_path / "newt" / name).write_bytes(SECRET)
     with pytest.raises(BadInput, match=r"0\.png: the file is a text file|mesh\.npz is not a NumPy archive"):
-        put_truth(find_ground_truth(tmp_path / "newt"), store)
+        put_ground_truth(find_ground_truth(tmp_path / "newt"), store)
     assert len(kept(store)) == 1

@@ -207,7 +207,7 @@ def words(text: str, **changes: object) -> ConversionRequest:
 
 def test_words_are_a_source_whatever_the_spaces_between_them(weights: Path, store: ArtifactStore) -> None:
     one = job(words("a red dragon"), store)
-    assert one.drawn
+    assert one.generates_picture
     assert not one.moving
     assert one.source_name == '"a red dragon"'
     assert job(words(" a  red\ndragon "), store).digest() == one.digest()

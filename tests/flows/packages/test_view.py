@@ -17,7 +17,6 @@ from flows.packages import view as module
 from flows.packages.publish import Files, publish
 from flows.packages.verify import verify
 from flows.packages.view import VIEWER, view, viewer_facts, viewer_html, viewer_of_artifact, viewer_of_package
-from steps.artifacts import packages
 
 CONTENT = {"asset.json": b"{}", "asset.glb": b"glTF", "splats/moving.websplats": b"D4WS", "input/subject.png": b"png"}
 STEP = {"step": "fit_gaussians", "digest": "sha256:1", "backend": "cpu", "seed": 3, "weights": {}, "notes": ["a note"]}
@@ -152,7 +151,3 @@ def test_a_browser_is_opened_where_there_is_a_screen(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     view(package, open_browser=asked)
     assert opened == [(package / VIEWER).resolve().as_uri()] * shown
-
-
-def test_files_have_the_names_of_the_package() -> None:
-    assert (module.ASSET, module.SUBJECT) == (packages.ASSET, packages.SUBJECT)

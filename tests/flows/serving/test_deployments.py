@@ -216,7 +216,7 @@ def test_a_folder_is_not_watched_on_a_server_that_would_lose_its_files(
 ) -> None:
     watching.check_registered()
     monkeypatch.setattr(watching, missing, "catalog-to-4d/Nothing")
-    monkeypatch.setattr(watching.Watcher, "look", lambda *_: pytest.fail("it is watched"))
+    monkeypatch.setattr(watching.Watcher, "poll", lambda *_: pytest.fail("it is watched"))
     Path("in").mkdir()
     done = dg4d("watch", "in", "-o", "out")
     assert done.exit_code == 69 and "run `dg4d up` first" in done.stderr
@@ -228,8 +228,8 @@ def test_the_failed_runs_of_a_watched_folder_are_known(client: SyncPrefectClient
     for out, message in (("out", "no items"), ("elsewhere", "another")):
         given = {"inputs": "in", "out": str(tmp_path / out)}
         client.create_flow_run_from_deployment(catalog.id, name="in", parameters=given, state=Failed(message=message))
-    assert runs.look() == ["failed: run in: no items"]
-    assert runs.look() == watching.FailedRuns(tmp_path / "out").look() == []
+    assert runs.poll() == ["failed: run in: no items"]
+    assert runs.poll() == watching.FailedRuns(tmp_path / "out").poll() == []
 
 
 @pytest.mark.slow

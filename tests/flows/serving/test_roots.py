@@ -391,11 +391,11 @@ def test_the_command_grants_what_it_watches(place: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("flows.serving.watching.FailedRuns._failed", lambda _: [])
     seen: list[Roots] = []
 
-    def look(*_: object) -> None:
+    def poll(*_: object) -> None:
         seen.append(Roots.of_this_process())
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flows.serving.watching.Watcher.look", look)
+    monkeypatch.setattr("flows.serving.watching.Watcher.poll", poll)
     from typer.testing import CliRunner
 
     from flows import cli

@@ -93,7 +93,10 @@ def test_a_mask_that_claims_to_be_huge_is_refused(draft: Draft) -> None:
 
 def test_a_mask_that_was_not_drawn_is_asked_for(draft: Draft) -> None:
     receive(draft, "fox.png", PNG)
-    for ask in (lambda: quick.films(draft, "preview", masked=True), lambda: convert(draft, Submission(masked=True))):
+    for ask in (
+        lambda: quick.motion_previews(draft, "preview", masked=True),
+        lambda: convert(draft, Submission(masked=True)),
+    ):
         with pytest.raises(BadInput, match="no mask yet; paint"):
             ask()
 

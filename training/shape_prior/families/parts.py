@@ -21,7 +21,7 @@ def curve(start: Point, yaw: float, pitch: float, length: float, bends: Sequence
         yaw: radians, towards +x.
         pitch: radians, towards +y.
         length: of all segments together.
-        bends: what is added to yaw and pitch after every segment; as many segments as bends.
+        bends: changes of yaw and pitch after every segment; as many segments as bends.
     """
     points = [np.asarray(start, float)]
     for more_yaw, more_pitch in bends:
@@ -51,7 +51,7 @@ def limb(
         swings: angle of every segment in the plane of the walk, radians from straight down, forwards.
         lean: outward angle, radians; towards +x.
         materials: of the segments; the last one goes on.
-        foot: what is at its end.
+        foot: shape of its end.
         foot_size: object units.
         foot_material: of the foot.
     """

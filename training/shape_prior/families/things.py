@@ -460,7 +460,7 @@ def food(chance: Chance, shape: Shape) -> None:
 
 
 def composition(chance: Chance, shape: Shape) -> None:
-    """Add a random heap of solids, most often with a mirror plane, sometimes with a face: what no family covers."""
+    """Add a random heap of solids, most often with a mirror plane, sometimes with a face."""
     shape.blend = chance.pick((0.0, 0.03, 0.1))
     shape.symmetric = chance.happens(0.8)
     for _ in range(chance.integer(2, 7)):

@@ -10,7 +10,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "dg4d_lib" / "visual_hull"))
 from creatures import creature, seen
 
-from benchmarks import drawn_views
+from benchmarks import generated_views
 from benchmarks.true_views import read_subjects
 from dg4d_lib.settings import OraclePriorSettings
 from dg4d_lib.visual_hull.known import known_view
@@ -43,8 +43,8 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_errors_are_the_knobs_and_spoiled_views_are_upside_down(objects: Path) -> None:
     (subject,) = read_subjects(objects)
     perfect, imperfect, spoiled = (
-        drawn_views.imperfect_bank(subject, errors, spoil)
-        for errors, spoil in ((OraclePriorSettings(), 0), (drawn_views.ERRORS, 0), (OraclePriorSettings(), 1))
+        generated_views.imperfect_bank(subject, errors, spoil)
+        for errors, spoil in ((OraclePriorSettings(), 0), (generated_views.ERRORS, 0), (OraclePriorSettings(), 1))
     )
     assert len(perfect.cameras) == 7
     assert perfect.cameras != imperfect.cameras and not torch.equal(perfect.pictures, imperfect.pictures)
@@ -55,6 +55,6 @@ def test_errors_are_the_knobs_and_spoiled_views_are_upside_down(objects: Path) -
 @pytest.mark.slow
 def test_imperfect_views_give_a_shape_that_overlaps_the_true_one(objects: Path, tmp_path: Path) -> None:
     out = tmp_path / "found.json"
-    drawn_views.main([str(objects), "--first", "--json", str(out), "--sheet", str(tmp_path / "sheet.png"), *SMALL])
+    generated_views.main([str(objects), "--first", "--json", str(out), "--sheet", str(tmp_path / "sheet.png"), *SMALL])
     assert json.loads(out.read_text())["thing"]["iou"] > 0.8
     assert (tmp_path / "sheet.png").stat().st_size > 1000

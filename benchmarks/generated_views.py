@@ -1,6 +1,6 @@
-"""Quality of the profile `open` with imperfect views of frame 0 in place of drawn ones.
+"""Quality of the profile `open` with imperfect views of frame 0 in place of generated ones.
 
-    python -m benchmarks.drawn_views FOLDER [--only panda mage] [--spoil 2] [--sheet sheet.png]
+    python -m benchmarks.generated_views FOLDER [--only panda mage] [--spoil 2] [--sheet sheet.png]
 
 FOLDER is a data set of `steps.artifacts.ground_truth` whose objects also have `static/az_AZIMUTH.png`, frame 0 from
 other sides, and `bank/`. True views of frame 0 from eight azimuths and two elevations are blurred, tinted, shifted and
