@@ -30,12 +30,12 @@ _log = logging.getLogger(__name__)
 
 def njit(**options: Any) -> Callable[[Any], Any]:
     """Return Numba's decorator for these options, with our cache and the compilation notice."""
-    configure_numba()
+    _configure_numba()
     return numba.njit(**options)
 
 
 @cache
-def configure_numba() -> None:
+def _configure_numba() -> None:
     """Install our cache locators and the compilation notice, once."""
     ours = [f"{__name__}.{locator.__name__}" for locator in (_EnvironmentCache, _SourceFolderCache, _UserCache)]
     locators = ",".join([*ours, "IPythonCacheLocator", "ZipCacheLocator"])  # Numba's own, for kernels of others

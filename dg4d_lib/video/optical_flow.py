@@ -9,14 +9,11 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32
-from numba import njit
 from scipy import ndimage
 from skimage.transform import pyramid_reduce
 
 from dg4d_lib.errors import BadInput
-from dg4d_lib.kernels.compiling import configure_numba
-
-configure_numba()
+from dg4d_lib.kernels.compiling import njit
 
 KERNEL = {"fastmath": {"contract"}, "nogil": True, "cache": True, "error_model": "numpy"}
 LEVELS, SMALLEST = 10, 16  # of the pyramid: largest number of levels, and least side in pixels
