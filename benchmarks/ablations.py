@@ -7,10 +7,10 @@ our own, or those of a data set (`--data DIR`): a folder per object with input/,
 --bank` reads them. The table has means over objects and seeds, with the standard deviation after +-; the sentence below
 compares pairs of the same object and seed. `--quick` is a smoke test.
 
-Of the paper's representations of motion, its fits per frame are the rows "every frame from ...": separate Gaussians
-with parameters of their own, optimized by the static stage for as many iterations as the motion has. The rows
-"frame-wise ..." are ours: one set of Gaussians whose colors and opacities are shared and frozen, with a table of
-displacements of mean, scale and rotation per frame, fitted with the motion of the other rows.
+The paper's fits per frame are the rows "every frame from ...": separate Gaussians for every frame, optimized by the
+static stage for as many iterations as the dynamic stage has. The rows "frame-wise ..." are ours: one set of Gaussians
+with shared, frozen colors and opacities, and a table of displacements of mean, scale and rotation per frame, fitted by
+the dynamic stage like the other rows.
 
 Unlike a diffusion model, an oracle is consistent over iterations. Claims of the paper that depend on this cannot be
 tested here; their `caveat` states this.
@@ -42,7 +42,7 @@ DIGITS = {"psnr": 2, "psnr_obj": 2, "iou": 3, "terr": 3, "flicker": 2}
 LESS_IS_BETTER = {"terr", "flicker"}
 CONFIDENCE = 0.95  # confidence level of the interval of a gain, Student's t over the pairs
 NEGLIGIBLE = {"psnr": 0.1, "psnr_obj": 0.1, "iou": 0.005, "terr": 0.01}  # invisible gains (ours)
-SHARES = ("subject.max_frames", "deformation.temporal")  # fractions of these are fractions of the frames
+SHARES = ("subject.max_frames", "deformation.temporal")  # a float in these is a fraction of the frames
 
 SMALL: dict[str, Any] = {  # the paper's schedule scaled to seconds on a CPU: fewer iterations, larger learning rates
     "prior.kind": "oracle",
@@ -85,7 +85,7 @@ class Variant:
         changes: of the settings, by dotted name.
         per_frame: fit every frame separately with the static stage, from a random ball.
         from_static: these fits start from the Gaussians of the static stage instead.
-        factors: of numbers in the settings of all variants, by dotted name.
+        factors: multiply settings that all variants share, by dotted name.
     """
 
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -159,7 +159,8 @@ ABLATIONS: dict[str, Ablation] = {
             Claim("HexPlane", "every frame from a blob", "terr"),
             Claim("every frame from the static stage", "every frame from a blob", "psnr_obj"),
         ),
-        caveat="a perfect oracle is consistent over frames and leaves no flicker to regularize; use --imperfect",
+        caveat="the oracle is consistent over iterations, and without --imperfect over frames: no flicker is left to "
+        "regularize",
     ),
     "resolution": Ablation(
         "a resolution of 32 in space and time is best",
@@ -286,7 +287,7 @@ class Row:
 def settings_of(
     changes: Mapping[str, Any], size: int, frames: int, factors: Mapping[str, float] | None = None
 ) -> PipelineSettings:
-    """Return the small schedule with changes, times factors; fractions of `SHARES` become numbers of frames."""
+    """Return the small schedule with changes and factors applied; fractions of `SHARES` become numbers of frames."""
     schedule = [{"until": 1.0, "size": size}]
     sizes = {
         f"{stage}.{name}": value
@@ -388,7 +389,7 @@ def main() -> None:
     parser.add_argument("names", nargs="+", choices=list(ABLATIONS), metavar="NAME", help=", ".join(ABLATIONS))
     parser.add_argument(
         "--objects",
-        type=lambda names: names.split(","),  # of one word: more would take the names of the ablations after it
+        type=lambda names: names.split(","),  # one argument: with nargs="+" it would also take NAME
         metavar="NAME[,NAME]",
         help=f"{', '.join(OBJECTS)}, or objects of DIR; default: all",
     )

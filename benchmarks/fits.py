@@ -28,7 +28,7 @@ from steps.fitting.priors import make_oracle_prior, make_prior, subject_shapes
 from steps.profiles import PipelineSettings
 
 RASTERIZE = get_rasterizer("auto")
-BANK_SEED = 0  # of the errors of an imperfect oracle, as in `make_oracle_prior`
+BANK_SEED = 0  # seed of the errors of an imperfect oracle, as in `make_oracle_prior`
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def fits_per_frame(
         specimen: the object.
         settings: of the pipeline.
         seed: of every fit.
-        start: initial Gaussians of every fit, all of whose parameters are optimized; None: by `static.start`.
+        start: initial Gaussians of every fit; None: by `static.start`. All their parameters are optimized.
     """
     static = settings.static.model_copy(update={"iterations": settings.motion.iterations})
     alone = settings.model_copy(update={"static": static})

@@ -28,6 +28,7 @@ from dg4d_lib.images import resize
 from dg4d_lib.settings import OraclePriorSettings
 from dg4d_lib.visual_hull.agreement import smaller
 from dg4d_lib.visual_hull.known import KnownView, known_view
+from flows.inputs.manifest import parse_changes
 from steps.artifacts.media import read_png
 from steps.fitting.priors import known_views, read_bank_folder
 from steps.generate_views import weighted_views
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the ground truth")
     given = parser.parse_args(arguments)
     min_weight = getattr(profile("open").views, "min_weight", 0.0)
-    changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
+    changes = parse_changes(given.set)
     settings = revise(profile("open"), {**WITHOUT_MODELS, **changes})
     errors = OraclePriorSettings() if given.perfect else ERRORS
     found: dict[str, Figures] = {}

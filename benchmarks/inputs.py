@@ -32,6 +32,7 @@ from dg4d_lib.guidance.interface import GuidanceView
 from dg4d_lib.guidance.oracle import Bank
 from dg4d_lib.images import over_white
 from dg4d_lib.inflation.hints import DepthHint
+from flows.inputs.manifest import parse_changes
 from steps.artifacts.media import write_png, write_zip
 from steps.fitting.priors import read_bank, read_bank_folder, subject_shapes
 from steps.prepare_views import run as prepare_views
@@ -141,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sheet", type=Path, help="picture: unseen views over time, above the ground truth")
     parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each --asset")
     given = parser.parse_args(arguments)
-    changes = {key: json.loads(value) for key, value in (pair.split("=", 1) for pair in given.set)}
+    changes = parse_changes(given.set)
     if given.asset:
         models = own_asset.read_models(given.asset, given.only)
         measured = own_asset.measure(models, revise(PREVIEW, changes).asset, own_asset.write_line, given.sheets)

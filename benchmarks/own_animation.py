@@ -36,6 +36,7 @@ from dg4d_lib.fitting.skeleton_motion import fit_skeleton_motion
 from dg4d_lib.geometry.quaternion import quat_to_rotmat
 from dg4d_lib.rasterizer.interface import get_rasterizer
 from dg4d_lib.video.driving import DrivingVideo
+from flows.inputs.manifest import parse_changes
 from steps.animate_asset import attach_controls, moved_vertices
 from steps.prepare_asset import cover, posed_model
 from steps.profiles import PREVIEW, revise
@@ -167,7 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--set", nargs="+", default=(), metavar="KEY=VALUE", help="settings of the fit")
     parser.add_argument("--sheets", type=Path, metavar="DIR", help="folder for a contact sheet of each")
     given = parser.parse_args(arguments)
-    settings = revise(PREVIEW, dict(one.split("=", 1) for one in given.set)).asset
+    settings = revise(PREVIEW, parse_changes(list(given.set))).asset
     found: dict[str, Figures] = {}
     write_line(f"{'':24}" + "".join(f"{column:>10}" for column in COLUMNS))
     for path in given.models:

@@ -42,6 +42,7 @@ from dg4d_lib.inflation.hints import DepthHint
 from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.video.subject import prepare_subject
+from flows.inputs.manifest import parse_changes
 from steps.artifacts.media import read_png
 from steps.fitting.priors import subject_shapes
 from steps.profiles import PREVIEW, PipelineSettings, revise
@@ -174,8 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.weights:
         packaged.WEIGHTS = given.weights
         packaged.SHA256 = hashlib.sha256(given.weights.read_bytes()).hexdigest()
-    changes = dict(pair.split("=", 1) for pair in given.set)
-    values = {key: json.loads(value) for key, value in changes.items()}
+    values = parse_changes(given.set)
     if given.pictures:
         compare_surfaces(given.pictures, given.kinds, values, given.sheet)
         return

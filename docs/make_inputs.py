@@ -21,7 +21,7 @@ from torch import Tensor
 from benchmarks.backdrops import procedural
 from benchmarks.inputs import known_bank
 from benchmarks.objects.drawing import Painted
-from benchmarks.own_asset import OwnModel, animate, draw_model
+from benchmarks.own_asset import OwnModel, animate, render_model
 from benchmarks.true_views import Subject, fit
 from dg4d_lib.assets.formats.model_glb import write_model_glb
 from dg4d_lib.cameras.orbit import OrbitCamera
@@ -139,7 +139,7 @@ def asset(painted: Painted) -> Way:
     def sheet() -> Tensor:
         moved = animate(own, PREVIEW.asset)[0][torch.tensor(SHOWN_FRAMES)]
         cameras = [OrbitCamera(0, azimuth, width=SIZE, height=SIZE) for azimuth in SHOWN_DEG]
-        return torch.cat([row([tile(one) for one in draw_model(model, moved, camera)]) for camera in cameras])
+        return torch.cat([row([tile(one) for one in render_model(model, moved, camera)]) for camera in cameras])
 
     return shown, sheet
 

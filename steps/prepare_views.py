@@ -276,10 +276,8 @@ def judge(views: Sequence[KnownView], found: Agreement) -> tuple[str, ...]:
 
 def exposure_notes(views: Sequence[KnownView], gains: Sequence[Float[Tensor, " 3"] | None]) -> tuple[str, ...]:
     """Return a note that names the views that get brighter or darker."""
-    changed = [view for view, gain in zip(views, gains, strict=True) if gain is not None]
-    return (
-        (f"exposure adjusted to the input: {', '.join(_describe_view(view) for view in changed)}",) if changed else ()
-    )
+    changed = [_describe_view(view) for view, gain in zip(views, gains, strict=True) if gain is not None]
+    return (f"exposure adjusted to the input: {', '.join(changed)}",) if changed else ()
 
 
 def picture_of(views: Sequence[KnownView]) -> Float[Tensor, "h w 3"]:

@@ -168,9 +168,9 @@ def _score_package(
     package = _unpacked(job.inputs["package"], scratch / "package")
     given = _read(ground_truth.inputs)
     size, total = given.color.shape[1], len(ground_truth.views) + 2
-    last = None  # frame of the input that the last frame of the fit shows; None is the last one
+    end = 1.0  # share of the input's time at which the last frame of the fit is reached
     if settings.max_frames and len(given) > 1:
-        last = evenly_spaced(len(given), settings.max_frames)[-1]
+        end = evenly_spaced(len(given), settings.max_frames)[-1] / (len(given) - 1)
 
     def render(azimuth_deg: float, frames: int | None) -> ViewFrames:
         (view,), _ = render_package(
@@ -182,7 +182,7 @@ def _score_package(
             settings.mesh,
             scratch / "ours",
             rasterizer=settings.rasterizer,
-            last=last,
+            end=end,
         )
         rendered = _read(sorted(view.iterdir()))
         shutil.rmtree(view)
@@ -204,7 +204,7 @@ def _score_package(
         job.progress(done, total, {})
     scores: Scores = {"input": of_input, "views": views, "mean": _mean(views)}
     if ground_truth.mesh is not None:
-        scores["geometry"] = _geometry(package, ground_truth.mesh, settings, job.seed, networks, last)
+        scores["geometry"] = _geometry(package, ground_truth.mesh, settings, job.seed, networks, end)
     job.progress(total, total, {})
     return _report(ground_truth, size, {"asset": scores}, clips), videos
 
@@ -251,13 +251,13 @@ def _mean(views: Mapping[str, Metrics]) -> Metrics:
 
 
 def _geometry(
-    package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int, networks: MetricNetworks, last: int | None
+    package: Path, mesh: Path, settings: ScoreAssetSettings, seed: int, networks: MetricNetworks, end: float
 ) -> Metrics:
     """Return chamfer distances to the true mesh, and ActionBench's if they are wanted."""
     meshes, score = read_true_meshes(mesh), settings.score
-    metrics = chamfer_scores(package, meshes, score.samples, seed, last)
+    metrics = chamfer_scores(package, meshes, score.samples, seed, end)
     if settings.actionbench:
-        found, reason = actionbench_scores(package, meshes, score.actionbench_points, score.icp_points, seed, last)
+        found, reason = actionbench_scores(package, meshes, score.actionbench_points, score.icp_points, seed, end)
         metrics |= found
         if reason:
             networks.missing["cd_m"] = reason

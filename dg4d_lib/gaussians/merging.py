@@ -24,9 +24,7 @@ HIGHEST_OPACITY = 0.995
 PAIRS = 0.4  # largest number of pairs per Gaussian in a round; later ones would mix different colors
 LARGEST_SCALE, LARGEST_LOGIT = 40.0, 20.0  # logarithm of the model's units, and logit: files hold any number
 THINNEST = 1e-12  # variance of a pair across a disc, of the sum of its variances, at least
-JITTER = (
-    1e-10  # relative to the largest coordinate: separates coincident Gaussians, which would all have the same neighbors
-)
+JITTER = 1e-10  # relative to the largest coordinate, or to 1: coincident Gaussians would all have the same neighbors
 
 
 def merge_gaussians(cloud: Gaussians, most: int) -> Gaussians:

@@ -10,9 +10,7 @@ from dg4d_lib.cameras.orbit import FOV_Y_DEG
 
 SUBJECT = 0.5  # alpha from which a pixel belongs to the subject
 FEWEST_FRAMES = 8  # single frames show raised feet: on synthetic poses their line is uninformative
-NARROWEST = (
-    0.3  # least length, share of the subject's width: shorter lines had the wrong sign for half of the synthetic shapes
-)
+NARROWEST = 0.3  # least length, share of the subject's width; shorter: wrong sign for half of the synthetic shapes
 SMALLEST_GAP = 0.1  # mean free height below the line, of its length: a solid base has two sides, and either may be long
 NEAREST_HORIZON = 0.02  # of the picture's height: depth is unbounded there
 LARGEST_DEG = 25.0

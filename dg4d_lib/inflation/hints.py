@@ -29,7 +29,7 @@ DEPTH_SHARE = 0.5  # assumed range of the visible depths, share of the subject's
 LEAST_COVERAGE = 0.1  # least covered share of a pixel with a depth
 LEAST_KNOWN = 0.25  # least share of the subject's pixels with a depth
 FLAT = 1e-4  # range of depths, relative to the median, below which a picture is flat
-GRAY_STEP = 2 / 255  # smallest difference between layers
+GRAY_STEP = 2 / 255  # gray levels that differ by less are one layer
 
 DepthKind = Literal["inverse", "distance"]
 

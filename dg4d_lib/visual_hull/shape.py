@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 
+from dg4d_lib.errors import BadInput
 from dg4d_lib.visual_hull.carve import Volume, hull
 from dg4d_lib.visual_hull.columns import bounded, fitting_turn
 from dg4d_lib.visual_hull.cover import REACH, covering
@@ -15,8 +17,9 @@ CELLS = 128  # along the longest side of the subject
 FINEST_CELLS = 192  # likewise, of thin subjects; a cell is about a pixel of the input then
 FEW_VERTICES = 40_000  # of a surface: with fewer, cells may be smaller
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
-LENIENCE = 0.5  # of `CELLS` by which silhouettes of drawn views are wider: these are a little wrong
-NEARLY = 0.5  # likewise, by which a place may violate silhouettes more than the best one behind its pixel
+# Tolerances in cells of a grid of `CELLS`; smaller cells get more of them.
+LENIENCE = 0.5  # by which silhouettes of generated views are wider: these are a little wrong
+NEARLY = 0.5  # by which a place may violate silhouettes more than the best one behind its pixel
 
 
 def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> Volume:
@@ -38,9 +41,11 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
     if shows_sides([view.camera for view in carving]):
         volume = hull(carving, CELLS, reach=REACH, lenience=LENIENCE)
         cells = fitting_cells(volume)
-        if cells > CELLS:
-            volume = hull(carving, cells, reach=REACH, lenience=LENIENCE * cells / CELLS)
-        return covering(volume, views[0], NEARLY * cells / CELLS)
+        finer = cells / CELLS
+        if finer > 1:
+            with suppress(BadInput):  # what views nearly carve away may lie between the finer points
+                volume = hull(carving, cells, reach=REACH, lenience=LENIENCE * finer)
+        return covering(volume, views[0], NEARLY * finer)
     columns = bounded(hull(carving, CELLS, reach=REACH), carving, fitting_turn(carving))
     return covering(columns, views[0], NEARLY)
 

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from dg4d_lib.asset_settings import ScoreSettings
 from dg4d_lib.errors import BadInput, DG4DError
+from dg4d_lib.input_settings import SubjectSettings
 from flows import home
 from flows.commands import terminal
 from flows.engine.leases import running
@@ -16,6 +17,7 @@ from flows.engine.output_lock import is_up_to_date
 from flows.exit_status import EXIT_BAD_INPUT, EXIT_MISSING, EXIT_STATUS
 from flows.inputs.conversion_job import ConversionJob, ConversionRequest
 from flows.inputs.manifest import parse_changes
+from flows.inputs.package_record import RECORD
 from flows.inputs.sources import put_zip
 from flows.packages import scores
 from flows.packages.publish import check_folder, check_writable, load_verified
@@ -77,6 +79,7 @@ def score(
         raise BadInput(f"{ground_truth} has no {MESH}; --actionbench compares with true meshes (vertices, faces)")
     settings = settings.model_copy(update={"actionbench": actionbench})
     record = load_verified(package)
+    most = frame_limit(record)
     if out is not None:
         check_writable(out.parent)
     from flows.convert import connect
@@ -91,7 +94,7 @@ def score(
             ground_truth=put_ground_truth(found, home.store()),
             package=put_package(package, record, home.store()),
             seconds=compute_seconds(record, mesh),
-            max_frames=frame_limit(record),
+            max_frames=most,
         )
         judged = score_assets(
             [entry], settings, f"{package.absolute().name} against {found.name}", package.absolute().name
@@ -290,7 +293,7 @@ def _entry(ground_truth: GroundTruth, folder: Path, row: Row, mesh: bool) -> "Be
         return BenchmarkEntry(name=ground_truth.name, ground_truth=ref, error=row.message, kind=row.kind)
     try:
         record = load_verified(folder)
-        package = put_package(folder, record, home.store())
+        package, most = put_package(folder, record, home.store()), frame_limit(record)
     except DG4DError as error:
         return BenchmarkEntry(name=ground_truth.name, ground_truth=ref, error=str(error), kind=type(error).__name__)
     return BenchmarkEntry(
@@ -298,7 +301,7 @@ def _entry(ground_truth: GroundTruth, folder: Path, row: Row, mesh: bool) -> "Be
         ground_truth=ref,
         package=package,
         seconds=compute_seconds(record, mesh),
-        max_frames=frame_limit(record),
+        max_frames=most,
     )
 
 
@@ -309,14 +312,26 @@ def compute_seconds(record: Mapping[str, Any], mesh: bool) -> float:
     refinement.
     """
     without = UNSCORED if mesh else UNSCORED | MESH_STEPS
-    steps = [step for step in record.get("run", {}).get("steps", []) if step["step"].split()[0] not in without]
+    steps = [step for step in record.get("run", {}).get("steps", []) if step["step"].partition(" ")[0] not in without]
     return round(sum(float(step.get("duration_s", 0.0)) for step in steps), 1)
 
 
 def frame_limit(record: Mapping[str, Any]) -> int:
-    """Return the number of frames that the video of a package was sampled to, at most; 0 if it follows no video."""
-    follows = any("footage" in step["outputs"] for step in record.get("steps", []))
-    return int(record["recipe"]["settings"]["subject"]["max_frames"]) if follows else 0
+    """Return the number of frames that the video of a package was sampled to, at most; 0 if it follows no video.
+
+    Raises:
+        BadInput: the record does not have this number.
+    """
+    try:
+        if not any("footage" in step["outputs"] for step in record.get("steps", [])):
+            return 0
+        subject = SubjectSettings(max_frames=record["recipe"]["settings"]["subject"]["max_frames"])
+    except (KeyError, TypeError, ValidationError) as error:
+        raise BadInput(
+            f"the {RECORD} of the asset does not say to how many frames its video was sampled "
+            "(recipe.settings.subject.max_frames); make the asset again"
+        ) from error
+    return subject.max_frames
 
 
 def _json(results: Results) -> str:

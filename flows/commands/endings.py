@@ -29,11 +29,8 @@ from flows.processes import start_reminder
 __all__ = ["EXIT_BAD_INPUT", "EXIT_FAILED", "Terminated", "exit_on_error"]
 
 UNREACHABLE = {errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR}  # errors of given paths
-NO_FOLDER = {
-    errno.EEXIST,
-    errno.ENOENT,
-    errno.ENOTDIR,
-}  # errors of mkdir if a file is in the way or the folder cannot exist
+# errors of mkdir if a file is in the way or the folder cannot exist
+NO_FOLDER = {errno.EEXIST, errno.ENOENT, errno.ENOTDIR}
 CODES = {signal.SIGHUP: EXIT_HANGUP, signal.SIGTERM: EXIT_TERMINATED}
 STOPPED = "stopped; run the same command again to continue after the last finished step"
 

@@ -143,9 +143,8 @@ def _serve(
     from flows.engine.item_runs import FLOW
     from flows.serving.registering import register
 
-    forms = [
-        name for name in register(known, pool_names) if not name.startswith(f"{FLOW}/")
-    ]  # catalogs start the others
+    # catalogs start the other deployments
+    forms = [name for name in register(known, pool_names) if not name.startswith(f"{FLOW}/")]
     if forms and not quiet:
         typer.echo("deployments with forms in the Prefect UI:", err=True)
         for name in forms:

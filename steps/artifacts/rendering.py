@@ -58,7 +58,7 @@ def render_package(
     out: Path,
     rasterizer: str = "auto",
     fit: bool = False,
-    last: int | None = None,
+    end: float = 1.0,
 ) -> Renders:
     """Write OUT/view_<azimuth>/NNN.png, RGBA with straight alpha, for every azimuth and frame.
 
@@ -73,7 +73,7 @@ def render_package(
         rasterizer: name of the rasterizer for splats.
         fit: take the field of view that holds the whole asset from all sides (`whole_fov_y_deg` of the manifest)
             instead of that of the input picture.
-        last: picture of `frames` that shows the last frame of the fit, as later ones do; None: the last picture.
+        end: share of `frames`, above 0, after which pictures show the last frame of the fit; see `fitted_positions`.
 
     Raises:
         BadInput: the folder is not a package, a broken one, or too old for `fit`, a number is out of range, or a view
@@ -88,7 +88,7 @@ def render_package(
     else:
         draw = splat_renderer(read_states(folder, manifest), get_rasterizer(rasterizer))
     every = torch.arange(manifest.frames, dtype=torch.float64)
-    positions = every if frames is None else fitted_positions(frames, folder, manifest, last)
+    positions = every if frames is None else fitted_positions(frames, folder, manifest, end)
     fov_y_deg = _whole_fov_y_deg(folder, manifest) if fit else FOV_Y_DEG
     count, cropped = len(positions), 0
     views = [out / f"view_{azimuth_deg + 0.0:g}" for azimuth_deg in azimuths_deg]
@@ -134,7 +134,7 @@ def _touches_edge(picture: Float[Tensor, "h w 4"]) -> bool:
     return any(bool((edge > OPAQUE).any()) for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
 
 
-def fitted_positions(count: int, folder: Path, manifest: Manifest, last: int | None = None) -> Float[Tensor, " n"]:
+def fitted_positions(count: int, folder: Path, manifest: Manifest, end: float = 1.0) -> Float[Tensor, " n"]:
     """Return evenly spaced positions from the first to the last frame of the fit, in frames of the package.
 
     The last frames of a package with another frame rate than the fit (`pack.fps`) lead back to the first.
@@ -143,12 +143,12 @@ def fitted_positions(count: int, folder: Path, manifest: Manifest, last: int | N
         count: number of positions.
         folder: unpacked package.
         manifest: of the package.
-        last: index of the position of the last frame, which later ones repeat; None: the last position.
+        end: share of the time from the first to the last position, above 0, after which the last frame is repeated.
     """
     fitted = read_compact(folder / COMPACT).frames if (folder / COMPACT).is_file() else manifest.frames
-    end = (fitted - 1) * manifest.frames / fitted
-    last = count - 1 if last is None else last
-    return torch.arange(count, dtype=torch.float64).clamp(max=last) * end / max(1, last)
+    last = (fitted - 1) * manifest.frames / fitted
+    span = max(1, count - 1) * end
+    return torch.arange(count, dtype=torch.float64).clamp(max=span) * last / span
 
 
 def read_states(folder: Path, manifest: Manifest) -> States:

@@ -56,7 +56,7 @@ def read_true_meshes(path: Path) -> TrueMeshes:
 
 
 def chamfer_scores(
-    package: Path, ground_truth: TrueMeshes, samples: int, seed: int, last: int | None = None
+    package: Path, ground_truth: TrueMeshes, samples: int, seed: int, end: float = 1.0
 ) -> dict[str, float]:
     """Return chamfer distances, means over frames: without and with one alignment of bounding boxes.
 
@@ -65,7 +65,7 @@ def chamfer_scores(
         ground_truth: true meshes.
         samples: points per surface.
         seed: of all samples.
-        last: true frame that the last frame of the fit shows; None: the last one.
+        end: share of the true frames' time after which the last frame of the fit is repeated.
     """
     generator = torch.Generator().manual_seed(seed)
     theirs = torch.stack(
@@ -74,7 +74,7 @@ def chamfer_scores(
             for frame in ground_truth.vertices
         ]
     )
-    meshes, _ = _meshes(package, len(ground_truth), last)
+    meshes, _ = _meshes(package, len(ground_truth), end)
     ours = torch.stack([sample_surface(mesh.vertices, mesh.faces, samples, generator) for mesh in meshes])
     return {
         name: fmean(chamfer_distance(a, b) for a, b in zip(points, theirs, strict=True))
@@ -83,7 +83,7 @@ def chamfer_scores(
 
 
 def actionbench_scores(
-    package: Path, ground_truth: TrueMeshes, samples: int, icp_points: int, seed: int, last: int | None = None
+    package: Path, ground_truth: TrueMeshes, samples: int, icp_points: int, seed: int, end: float = 1.0
 ) -> tuple[dict[str, float], str]:
     """Return CD-3D, CD-4D and, of a tracked mesh, CD-M; and the reason why the last is missing, else nothing.
 
@@ -93,14 +93,14 @@ def actionbench_scores(
         samples: points per surface.
         icp_points: points for the alignment.
         seed: of all samples.
-        last: true frame that the last frame of the fit shows; None: the last one.
+        end: share of the true frames' time after which the last frame of the fit is repeated.
     """
     generator = torch.Generator().manual_seed(seed)
     center, factor = unit_box(ground_truth.vertices.double())
     places = place_points(ground_truth.vertices[0], ground_truth.faces, samples, generator, ground_truth.weights)
     theirs = torch.stack([places.at(frame) for frame in ground_truth.vertices])
     theirs = (theirs - center) * factor
-    meshes, tracked = _meshes(package, len(ground_truth), last)
+    meshes, tracked = _meshes(package, len(ground_truth), end)
     ours = torch.stack([sample_surface(mesh.vertices, mesh.faces, samples, generator) for mesh in meshes])
     ours = (ours - center) * factor
     alignments = [align_points(a[:icp_points], b[:icp_points]) for a, b in zip(ours, theirs, strict=True)]
@@ -112,9 +112,9 @@ def actionbench_scores(
     return {**found, "cd_m": chamfer_motion((followed - center) * factor, theirs, alignments[0])}, ""
 
 
-def _meshes(package: Path, frames: int, last: int | None) -> tuple[list[TexturedMesh], bool]:
+def _meshes(package: Path, frames: int, end: float) -> tuple[list[TexturedMesh], bool]:
     """Return the mesh at evenly spaced times, and whether all have the same triangles."""
     manifest = read_manifest(package)
     surface = read_surface(package, manifest)
-    meshes = [mesh_at(surface, position) for position in fitted_positions(frames, package, manifest, last)]
+    meshes = [mesh_at(surface, position) for position in fitted_positions(frames, package, manifest, end)]
     return meshes, isinstance(surface, Asset4D)

@@ -43,6 +43,7 @@ BESIDE_FLOW = (*BENT, SOFT)  # likewise
 SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (2.0, 4.0))  # beside SWING
 CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
 CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
+HINGE_SEED = 0  # of the tracking that serves the search of a hinge: it draws from no other generator
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 
 
@@ -67,7 +68,7 @@ def tracking_of(known: Bank) -> AssetSettings:
 def most_iterations(known: Bank, video: DrivingVideo, trackings: int) -> int:
     """Return the largest number of iterations that a `SurfaceTracker` reports."""
     first = tracking_of(known)
-    second = (SWING,) if first is FLOW else ()  # hulls of few pictures are seldom lost
+    second = (SWING,) if first is FLOW else (HINGE,)  # hulls of few pictures are seldom lost
     more = (*second, *_others(first)) if trackings > 1 else second
     return sum(tracking_iterations(settings, video) for settings in (first, *more)) + HINGE_ITERATIONS
 
@@ -80,7 +81,8 @@ def _others(first: AssetSettings) -> tuple[AssetSettings, ...]:
 class SurfaceTracker:
     """Moves the surface of known views of the first frame as the video shows it.
 
-    If the motion is that of a lid or a door on a hinge, the fit of the hinge is the answer. Else a surface that loses
+    If the motion is that of a lid or a door on a hinge, the fit of the hinge is the answer; hulls of few pictures are
+    tracked with little rigidity for its search, as a stiff lid does not tear off. Else a surface that loses
     the outline, or that flow follows badly, is tracked a second time, with limbs that swing; `swinging_is_better`
     chooses between the two motions. Surfaces are then tracked in two or three more ways, whose errors at unseen sides
     differ: two stiffer ones where limbs swing; else hulls of few pictures by flow and with limbs that swing, those of
@@ -122,7 +124,7 @@ class SurfaceTracker:
             share = CARRIED_BESIDE_SEVERAL if self._several and self._first is SOFT else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
-            self.hinged = self._on_a_hinge(moved) if overlap >= LOST else None
+            self.hinged = self._on_a_hinge(self._loose(moved)) if overlap >= LOST else None
             if self.hinged:
                 return Tracked([MovedSurfaces(self.hinged.surfaces)], CARRIED_SHARE)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
@@ -150,6 +152,12 @@ class SurfaceTracker:
                 surface, self._gaussians, self._video, self._rasterize, settings, generator, self._next_report()
             )
         )
+
+    def _loose(self, moved: MovedSurfaces) -> MovedSurfaces:
+        """Return the motion in which a hinge is searched."""
+        if self._first is FLOW:
+            return moved
+        return self._follow(moved.surface(0), HINGE, torch.Generator().manual_seed(HINGE_SEED))
 
     def _on_a_hinge(self, free: MovedSurfaces) -> Hinged | None:
         surfaces = [free.surface(frame) for frame in range(len(self._video))]

@@ -95,13 +95,27 @@ def test_a_video_that_was_sampled_is_scored_at_the_times_of_its_frames(
 ) -> None:
     whole = tmp_path / "truth"  # 6 frames, of which a video of 3 keeps 0, 2 and 4; at the end it stands
     for name in ("view_0", "view_15"):
-        render_package(package, (float(name[5:]),), 0.0, SIZE, 6, False, whole, rasterizer="reference", last=4)
+        render_package(package, (float(name[5:]),), 0.0, SIZE, 6, False, whole, rasterizer="reference", end=0.8)
     (whole / "view_0").rename(whole / "input")
     assert (whole / "input/004.png").read_bytes() == (whole / "input/005.png").read_bytes()
     sampled, _ = score(tmp_path / "a", whole, package, max_frames=3)
     assert sampled["rows"]["asset"]["mean"]["psnr"] == pytest.approx(60)
     stretched, _ = score(tmp_path / "b", whole, package)
     assert stretched["rows"]["asset"]["mean"]["psnr"] < 40
+
+
+def test_true_meshes_may_have_more_frames_than_a_video_that_was_sampled(
+    package: Path, truth: Path, tmp_path: Path
+) -> None:
+    whole = small_truth(tmp_path / "truth", truth, lambda v: v, 6)  # of which a video of 3 keeps 0, 2 and 4
+    asset = tracked(9)
+    vertices = (asset.mesh.vertices + asset.offsets).numpy()  # 0 to 8 of 11; then it stands
+    np.savez(whole / "mesh.npz", vertices=vertices[[*range(9), 8, 8]], faces=asset.mesh.faces.numpy())
+    (sampled, _), (stretched, _) = (
+        score(tmp_path / str(most), whole, package, max_frames=most, samples=4000) for most in (3, 0)
+    )
+    assert sampled["rows"]["asset"]["geometry"]["chamfer"] < 0.012  # with points 0.007 apart
+    assert stretched["rows"]["asset"]["geometry"]["chamfer"] > 0.018
 
 
 def test_a_mesh_elsewhere_is_far_until_it_is_aligned(package: Path, truth: Path, tmp_path: Path) -> None:

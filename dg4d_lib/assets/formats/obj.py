@@ -163,7 +163,7 @@ def _corner(word: str, positions: int, uvs: int) -> tuple[int, int]:
 
 
 def _index(text: str, count: int) -> int:
-    """Convert an index that counts from 1, or backwards from -1, to one from 0; negative if there is no such item."""
+    """Convert an index that counts from 1, or backwards from -1, to one from 0; negative for 0 and before the first."""
     value = int(text)
     return value - 1 if value >= 0 else count + value
 

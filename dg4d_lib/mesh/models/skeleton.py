@@ -33,7 +33,7 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class JointGraph:
-    """Joints as control nodes: the first node, at their center, is the parent of all roots and moves all other points.
+    """Joints as control nodes: the first node, at their center, is the parent of all roots and moves unweighted points.
 
     Attributes:
         graph: nodes, the points that they move, and the edges from joints to their parents.
@@ -86,7 +86,7 @@ def _at_fine_vertices(weights: csr_array, surface: SurfaceCloud, faces: Int[np.n
 
 
 def _heaviest(weights: csr_array) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
-    """Return the nodes that move every point, and their weights; node 0 takes the remaining weight."""
+    """Return the nodes that move every point, and their weights; node 0 moves points without weights."""
     count = min(INFLUENCES, weights.shape[1])
     indices, shares = [], []
     for start in range(0, weights.shape[0], ROWS):

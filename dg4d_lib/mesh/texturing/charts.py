@@ -111,9 +111,8 @@ def _merged(surface: "_Surface", labels: Labels, limits: Limits, least: int) -> 
         fresh = labels.max() + 1
         for first, second in pairs:
             if passed[first]:
-                labels = np.where(
-                    merged == first, fresh, labels
-                )  # new label: merges that were refused for its parts may be tried again
+                # a new label, so that merges that were refused for its parts are tried again
+                labels = np.where(merged == first, fresh, labels)
                 fresh += 1
             else:
                 refused.add((first, second))

@@ -116,7 +116,7 @@ def test_the_network_sees_positions_and_times_from_minus_one_to_one(cloud):
 
 
 @pytest.mark.parametrize("kind", ["hexplane", "mlp"])
-def test_the_last_frame_lies_where_the_time_axis_is_told(kind: str, cloud):
+def test_the_last_frame_lies_at_the_given_place_on_the_time_axis(kind: str, cloud):
     whole = make(kind)
     for parameter in whole.parameters():
         torch.nn.init.uniform_(parameter, 0.1, 0.5, generator=torch.Generator().manual_seed(2))

@@ -31,7 +31,7 @@ def test_coincident_points_still_have_a_size():
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
-def test_fewer_gaussians_than_neighbors_have_the_distance_of_those_there_are(count: int):
+def test_small_clouds_are_scaled_by_the_neighbors_that_exist(count: int):
     cloud = blob(count, 0.5, torch.Generator().manual_seed(0))
     between = torch.cdist(cloud.means, cloud.means).square().sum(1) / (count - 1)
     torch.testing.assert_close(cloud.scales[:, 0], between.sqrt())

@@ -53,7 +53,7 @@ def test_two_at_one_place_are_as_opaque_as_both() -> None:
     assert merge_gaussians(pair(0.0, (0.9, 0.9)), 1).opacities.item() == pytest.approx(0.99)
 
 
-def test_a_pair_covers_what_both_cover_without_what_they_share() -> None:
+def test_a_merged_pair_covers_the_union_of_both() -> None:
     """Two balls two standard deviations apart become a spheroid with axes in the ratio of 1 to the root of 2."""
     area = 0.1**2 * (1 + math.pi / 2) / 2  # of the spheroid, over 4 pi
     covered = 0.1**2 * (0.5 + 0.5 - 0.5 * 0.5 * math.exp(-1))

@@ -11,7 +11,7 @@ from dg4d_lib.metrics.image import iou
 from dg4d_lib.visual_hull.carve import TRUNCATION, Volume, hull, margins_of
 from dg4d_lib.visual_hull.cover import REACH, covering
 from dg4d_lib.visual_hull.known import KnownView
-from dg4d_lib.visual_hull.shape import ALL_AROUND, CELLS, FINEST_CELLS, NEARLY, known_volume
+from dg4d_lib.visual_hull.shape import ALL_AROUND, CELLS, FINEST_CELLS, NEARLY, fitting_cells, known_volume
 from dg4d_lib.visual_hull.surface import colored_surface
 
 MANY = ALL_AROUND + 4
@@ -78,5 +78,4 @@ def test_cells_of_thin_subjects_are_smaller() -> None:
         for surface in (colored_surface(volume, views) for volume in (coarse, fine))
     ]
     assert overlaps[1] > overlaps[0] + 0.005
-    solid = ring(MANY, ball)
-    assert known_volume(solid).step == hull(solid, CELLS, reach=REACH).step
+    assert fitting_cells(hull(ring(MANY, ball), CELLS, reach=REACH)) == CELLS

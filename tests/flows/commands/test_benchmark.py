@@ -266,6 +266,20 @@ def test_times_hold_what_is_scored_and_no_more(mesh: bool, seconds: float) -> No
     assert compute_seconds({"run": {"steps": steps}}, mesh) == seconds
 
 
+def test_a_step_without_a_name_has_a_time() -> None:
+    assert compute_seconds({"run": {"steps": [{"step": "", "duration_s": 3}]}}, mesh=False) == 3
+
+
+@pytest.mark.parametrize(
+    "recipe", [{}, None, {"settings": {"subject": {"max_frames": 1}}}, {"settings": {"subject": {"max_frames": "x"}}}]
+)
+def test_a_record_without_the_number_of_frames_of_its_video_is_refused(recipe: object) -> None:
+    steps = [{"step": "prepare_subject", "outputs": {"footage": "sha256:0"}}]
+    for record in ({"steps": steps, "recipe": recipe}, {"steps": [{"step": "prepare_subject"}]}):
+        with pytest.raises(BadInput, match=r"to how many frames its video was sampled.*make the asset again"):
+            frame_limit(record)
+
+
 @pytest.mark.parametrize(("port", "most"), [("footage", 16), ("subject", 0)])
 def test_the_score_knows_to_how_many_frames_a_video_was_sampled(port: str, most: int) -> None:
     steps = [{"step": "prepare_subject", "outputs": {port: "sha256:0"}}]

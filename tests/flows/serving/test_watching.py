@@ -52,14 +52,14 @@ def test_a_state_is_told_once_and_again_after_a_restart(folder: Path) -> None:
 
 
 def test_a_busy_folder_is_announced_before_it_comes_to_rest(folder: Path) -> None:
-    looking, mark_announced = watcher(folder), list[int]()
+    looking, announced = watcher(folder), list[int]()
     for second in range(700):
         if second % 8 == 0:
             (folder / f"shot-{second}.png").write_text("picture")
         if looking.poll(second) is not None:
             looking.mark_announced()
-            mark_announced.append(second)
-    assert mark_announced == [300, 604]
+            announced.append(second)
+    assert announced == [300, 604]
 
 
 def test_a_file_that_still_grows_alone_is_not_announced(folder: Path) -> None:
