@@ -182,10 +182,10 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
 ):
     write_bank(tmp_path / "known.zip", [[known_view(disc(), 90.0)]], tmp_path)
     small = {"track_iterations": 2, "joint_iterations": 1, "nodes": 8, "size": 32}
-    monkeypatch.setattr(tracking, "SOFT", tracking.SOFT.model_copy(update=small))
+    for name in ("HINGE", "SOFT", "SWING"):
+        monkeypatch.setattr(tracking, name, getattr(tracking, name).model_copy(update=small))
     for name in ("BESIDE_SOFT", "SWINGS"):
         monkeypatch.setattr(tracking, name, tuple(one.model_copy(update=small) for one in getattr(tracking, name)))
-    monkeypatch.setattr(tracking, "SWING", tracking.SWING.model_copy(update=small))
     settings = revise(SMALL, {"motion.track_surface": True})
     statics = job(tmp_path, fit_settings(), {"subject": subject}, STATIC)
     fit_gaussians.run(statics)
@@ -211,7 +211,8 @@ def test_the_tracked_surface_of_known_views_guides_later_frames(
             ["motion", "gaussians", "curves", "picture"],
         )
         assert (TRACKED_NOTE in fit_motion.run(work).notes) == bool(count)
-        tracked = settings.motion.trackings * (2 * count + 1) + HINGE_ITERATIONS if count else 0
+        ways = settings.motion.trackings + 1  # one serves the search of a hinge
+        tracked = ways * (2 * count + 1) + HINGE_ITERATIONS if count else 0
         assert isinstance(read_motion(work.outputs["motion"]).deformation, OnParts) == (name == "hinged")
         assert json.loads(work.outputs["curves"].read_text())["x"][-1] == settings.motion.iterations + tracked
 
