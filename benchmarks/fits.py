@@ -48,14 +48,14 @@ def static_fit(specimen: Specimen, settings: PipelineSettings, seed: int) -> Gau
         BadInput: the prior's weights are damaged or of another model, or the fit should start with LGM.
         BackendUnavailable: the prior's weights are not installed.
     """
-    return _fit_first_frame(_with_errors(specimen, settings), settings, seed)
+    return _fit_first_frame(_perturbed(specimen, settings), settings, seed)
 
 
 def moving_fit(specimen: Specimen, rest: Gaussians, settings: PipelineSettings, seed: int) -> list[Gaussians]:
     """Run the dynamic stage; return the cloud at every frame, including frames that were not fitted."""
     generator = torch.Generator().manual_seed(seed)
     frames = len(specimen.cutouts)
-    seen, stride = subsample_frames(_with_errors(specimen, settings), settings.subject.max_frames)
+    seen, stride = subsample_frames(_perturbed(specimen, settings), settings.subject.max_frames)
     deformation = new_deformation(settings.deformation, rest, len(seen.cutouts), generator)
     prior = prior_of(seen, settings, settings.motion)
     fitted = fit_motion(rest, deformation, seen.video, prior, RASTERIZE, settings.motion, generator)
@@ -78,9 +78,9 @@ def fits_per_frame(
     """
     static = settings.static.model_copy(update={"iterations": settings.motion.iterations})
     alone = settings.model_copy(update={"static": static})
-    flawed = _with_errors(specimen, settings)
+    perturbed = _perturbed(specimen, settings)
     frames = range(len(specimen.cutouts))
-    return [_fit_first_frame(_single_frame(flawed, frame), alone, seed, start) for frame in frames]
+    return [_fit_first_frame(_single_frame(perturbed, frame), alone, seed, start) for frame in frames]
 
 
 def score(specimen: Specimen, states: Sequence[Gaussians]) -> Figures:
@@ -140,7 +140,7 @@ def _hint(settings: PipelineSettings) -> DepthHint:
     return DepthHint(settings.subject.turn_deg or None)
 
 
-def _with_errors(specimen: Specimen, settings: PipelineSettings) -> Specimen:
+def _perturbed(specimen: Specimen, settings: PipelineSettings) -> Specimen:
     """Return the specimen with the errors of an imperfect oracle in its bank.
 
     They are drawn for the whole bank, before frames are taken from it, so that all fits of an object see the same

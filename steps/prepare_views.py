@@ -20,7 +20,7 @@ from steps.artifacts.archives import unpack
 from steps.artifacts.media import read_frames, read_png, write_png
 from steps.runtime.job import Job, StepReport
 from steps.sources.bank_writer import write_bank
-from steps.sources.clips import evenly_spaced
+from steps.sources.clips import sampled_frames
 from steps.sources.masks import read_mask, scaled_box
 from steps.sources.networks import LoadedNetwork, open_network
 from steps.sources.placing import place_pictures
@@ -126,7 +126,7 @@ class _Reader:
         """Return the views of a turntable in the direction that fits better, and those of pictures beside it."""
         source = self._read(given.turntable, TURNTABLE, TURNTABLE_FRAMES)
         check_turn(source)
-        places = evenly_spaced(source.count, TURNTABLE_FRAMES)
+        places = sampled_frames(source.count, TURNTABLE_FRAMES)
         prepared = self._cut(source, TURNTABLE)
         notes, angles = prepared.notes, [360 * place / source.count for place in places]
         views = self._turntable_sides(prepared.frames, angles)
@@ -233,7 +233,7 @@ def check_turn(source: Source) -> None:
     steps = color.diff(dim=0).abs().mean((1, 2, 3))
     if float(from_first.max()) < STILL:
         raise BadInput(f"{TURNTABLE} shows no turn: its frames are alike; record the still subject, turned once")
-    before, last = evenly_spaced(source.count, TURNTABLE_FRAMES)[-2:]
+    before, last = sampled_frames(source.count, TURNTABLE_FRAMES)[-2:]
     if float(from_first[-1]) > OPEN_SHARE * max(float(steps.max()), float(steps[-1]) / (last - before)):
         raise BadInput(
             f"{TURNTABLE} is not a whole turn: its last frame is unlike its first; record one turn, and cut right "

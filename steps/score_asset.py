@@ -34,7 +34,7 @@ from steps.artifacts.surface_scores import actionbench_scores, chamfer_scores, r
 from steps.profiles import ScoreAssetSettings
 from steps.runtime.job import Job, StepReport
 from steps.runtime.weights import open_weights
-from steps.sources.clips import evenly_spaced
+from steps.sources.clips import sampled_frames
 from steps.sources.decode_limit import DecodeLimit
 from steps.sources.stills import MOST_PIXELS, StillPicture, read_still
 
@@ -170,7 +170,7 @@ def _score_package(
     size, total = given.color.shape[1], len(ground_truth.views) + 2
     end = 1.0  # share of the input's time at which the last frame of the fit is reached
     if settings.max_frames and len(given) > 1:
-        end = evenly_spaced(len(given), settings.max_frames)[-1] / (len(given) - 1)
+        end = sampled_frames(len(given), settings.max_frames)[-1] / (len(given) - 1)
 
     def render(azimuth_deg: float, frames: int | None) -> ViewFrames:
         (view,), _ = render_package(

@@ -18,13 +18,13 @@ from dg4d_lib.visual_hull.known import KnownView, places_before
 REACH = 0.08  # world units outside of the hull in which matter is searched
 
 
-def covering(volume: Volume, view: KnownView, nearly: float) -> Volume:
+def covering(volume: Volume, view: KnownView, tolerance: float) -> Volume:
     """Return a hull with matter behind every pixel of a view.
 
     Args:
         volume: hull or columns, exact to `REACH` outside of them.
         view: whose silhouette is right.
-        nearly: cells by which a place may violate the silhouettes more than the best one behind its pixel.
+        tolerance: by which a place may violate the silhouettes more than the best one behind its pixel, world units.
     """
     values, limit = torch.from_numpy(volume.values), TRUNCATION * volume.step
     near = values > -REACH
@@ -34,7 +34,7 @@ def covering(volume: Volume, view: KnownView, nearly: float) -> Volume:
     inside = margins_of([view], points) > 0
     best = torch.full((count,), -torch.inf).scatter_reduce(0, pixel[inside], margins[inside], "amax")
     empty = inside & (best[pixel] <= 0)
-    filled = torch.where(empty, margins - best[pixel] + nearly * volume.step, -torch.inf)
+    filled = torch.where(empty, margins - best[pixel] + tolerance, -torch.inf)
     covered = values.clone()
     covered[near] = torch.maximum(margins, filled)
     return replace(volume, values=covered.clamp(-limit, limit).numpy())

@@ -17,7 +17,7 @@ CELLS = 128  # along the longest side of the subject
 FINEST_CELLS = 192  # likewise, of thin subjects; a cell is about a pixel of the input then
 FEW_VERTICES = 40_000  # of a surface: with fewer, cells may be smaller
 ALL_AROUND = 12  # known views from which silhouettes alone tell the shape, and limbs are apart
-# Tolerances in cells of a grid of `CELLS`; smaller cells get more of them.
+# Tolerances in cells of a grid of `CELLS`; on finer grids they stay the same in world units.
 LENIENCE = 0.5  # by which silhouettes of generated views are wider: these are a little wrong
 NEARLY = 0.5  # by which a place may violate silhouettes more than the best one behind its pixel
 
@@ -40,14 +40,18 @@ def known_volume(views: Sequence[KnownView], predict: Predict | None = None) -> 
         return probable(volume, views, predict) if predict is not None else volume
     if shows_sides([view.camera for view in carving]):
         volume = hull(carving, CELLS, reach=REACH, lenience=LENIENCE)
-        cells = fitting_cells(volume)
-        finer = cells / CELLS
-        if finer > 1:
-            with suppress(BadInput):  # what views nearly carve away may lie between the finer points
-                volume = hull(carving, cells, reach=REACH, lenience=LENIENCE * finer)
-        return covering(volume, views[0], NEARLY * finer)
+        return covering(_with_fitting_cells(volume, carving), views[0], NEARLY * volume.step)
     columns = bounded(hull(carving, CELLS, reach=REACH), carving, fitting_turn(carving))
-    return covering(columns, views[0], NEARLY)
+    return covering(columns, views[0], NEARLY * columns.step)
+
+
+def _with_fitting_cells(volume: Volume, carving: Sequence[KnownView]) -> Volume:
+    """Return the hull with smaller cells where `fitting_cells` asks for them."""
+    cells = fitting_cells(volume)
+    if cells > CELLS:
+        with suppress(BadInput):  # the finer grid may miss a hull of which hardly a cell is left
+            return hull(carving, cells, reach=REACH, lenience=LENIENCE * cells / CELLS)
+    return volume
 
 
 def fitting_cells(volume: Volume) -> int:

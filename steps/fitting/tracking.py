@@ -43,7 +43,7 @@ BESIDE_FLOW = (*BENT, SOFT)  # likewise
 SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (2.0, 4.0))  # beside SWING
 CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
 CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
-HINGE_SEED = 0  # of the tracking that serves the search of a hinge: it draws from no other generator
+HINGE_SEED = 0  # of the tracking for the search of a hinge; its own, so that all other random numbers stay the same
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 
 
@@ -124,7 +124,7 @@ class SurfaceTracker:
             share = CARRIED_BESIDE_SEVERAL if self._several and self._first is SOFT else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
-            self.hinged = self._on_a_hinge(self._loose(moved)) if overlap >= LOST else None
+            self.hinged = self._on_a_hinge(self._motion_for_hinges(moved)) if overlap >= LOST else None
             if self.hinged:
                 return Tracked([MovedSurfaces(self.hinged.surfaces)], CARRIED_SHARE)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
@@ -153,8 +153,8 @@ class SurfaceTracker:
             )
         )
 
-    def _loose(self, moved: MovedSurfaces) -> MovedSurfaces:
-        """Return the motion in which a hinge is searched."""
+    def _motion_for_hinges(self, moved: MovedSurfaces) -> MovedSurfaces:
+        """Return the motion in which a hinge is searched: the first one by flow, else one with little rigidity."""
         if self._first is FLOW:
             return moved
         return self._follow(moved.surface(0), HINGE, torch.Generator().manual_seed(HINGE_SEED))

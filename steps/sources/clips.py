@@ -42,11 +42,11 @@ APNG_OPTIONS = {"default_fps": str(1000 // SLOWED_MS)}  # rate of frames without
 ALPHA_DECODERS = {"vp9": "libvpx-vp9", "vp8": "libvpx"}  # FFmpeg's own decoders drop the alpha plane of WebM
 
 
-def evenly_spaced(count: int, most: int) -> list[int]:
-    """Return at most `most` indices below `count`, evenly spaced from the first on.
+def sampled_frames(count: int, most: int) -> list[int]:
+    """Return the indices of at most `most` frames of a video of `count`, evenly spaced from the first on.
 
-    Where `most` divides `count` they have one distance, such as every second frame of a video in the paper's fast
-    variant. Otherwise the last index is included, and distances differ by at most 1.
+    Where `most` divides `count`, the stride is constant, such as every second frame in the paper's fast variant.
+    Otherwise the last index is included, and distances differ by at most 1.
     """
     if count <= most:
         return list(range(count))
@@ -57,7 +57,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 
 def thinned_rate(fps: float, count: int, kept: int) -> float:
     """Return the rate at which `kept` evenly spaced frames of `count` move as fast as all of them do."""
-    return fps * (kept - 1) / evenly_spaced(count, kept)[-1] if kept > 1 else fps
+    return fps * (kept - 1) / sampled_frames(count, kept)[-1] if kept > 1 else fps
 
 
 def measured_rate(times: Sequence[float]) -> float:

@@ -19,7 +19,7 @@ from steps.sources.clips import (
     MOST_FRAMES,
     Clip,
     KeptFrames,
-    evenly_spaced,
+    sampled_frames,
     thinned_rate,
     uneven_note,
 )
@@ -80,7 +80,7 @@ def read_source(
     Args:
         path: file with any name.
         scratch: existing folder for links and unpacked pictures.
-        max_frames: number of frames to keep of a video, as `evenly_spaced` chooses them; at least 2.
+        max_frames: number of frames to keep of a video, as `sampled_frames` chooses them; at least 2.
         max_decode_gb: memory limit in GiB, which includes the decoded frames.
 
     Raises:
@@ -145,7 +145,7 @@ def _read_clip(path: Path, container: str, max_frames: int, limit: DecodeLimit) 
     if clip.count == 1 and container in ("gif", "apng"):
         return _picture(*clip.read([0]), clip.size)
     _need_two(clip.count, "the video")
-    frames, has_alpha = clip.read(evenly_spaced(clip.count, max_frames))
+    frames, has_alpha = clip.read(sampled_frames(clip.count, max_frames))
     lost = clip.announced - clip.count
     notes = (f"The video declares {clip.announced} frames; {clip.count} can be read.",) if lost > 1 else ()
     return _video(frames, has_alpha, clip.fps, clip.count, clip.size, (*notes, *clip.notes))
@@ -155,7 +155,7 @@ def _read_webp(path: Path, max_frames: int, limit: DecodeLimit) -> Source:
     limit.require_file(path, "the WebP animation")
     with path.open("rb") as file:
         clip = AnimatedWebp(file, limit)
-        kept = KeptFrames(evenly_spaced(len(clip), max_frames), "the WebP animation")
+        kept = KeptFrames(sampled_frames(len(clip), max_frames), "the WebP animation")
         for i, frame in enumerate(clip):
             if i in kept:
                 kept.add(i, downscale_in_bands(frame, kept.side))
@@ -190,7 +190,7 @@ def _zipped_frames(
     archive: zipfile.ZipFile, entries: list[zipfile.ZipInfo], scratch: Path, max_frames: int, limit: DecodeLimit
 ) -> tuple[Float[Tensor, "t h w 4"], bool, tuple[int, int], tuple[str, ...]]:
     """Decode every frame, so that none is broken; return the selected ones, True if one has alpha, size and notes."""
-    kept, any_alpha = KeptFrames(evenly_spaced(len(entries), max_frames), "the folder of frames"), False
+    kept, any_alpha = KeptFrames(sampled_frames(len(entries), max_frames), "the folder of frames"), False
     notes: tuple[str, ...] = ()
     first, pixels, start = (0, 0), 0, time.monotonic()
     for i, info in enumerate(entries):

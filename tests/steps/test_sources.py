@@ -18,7 +18,7 @@ from media_files import (
 from PIL import Image
 
 from dg4d_lib.errors import BadInput
-from steps.sources.clips import evenly_spaced, thinned_rate, work_side
+from steps.sources.clips import sampled_frames, thinned_rate, work_side
 from steps.sources.media_types import check_media
 from steps.sources.reader import Source, read_source
 
@@ -209,13 +209,13 @@ def test_a_long_video_is_sampled_with_its_ends_and_its_speed(tmp_path):
 
 @pytest.mark.parametrize(("count", "most", "stride"), [(32, 16, 2), (4, 2, 2), (96, 32, 3), (512, 32, 16)])
 def test_samples_have_one_distance_where_their_number_divides(count, most, stride):
-    assert evenly_spaced(count, most) == list(range(0, count, stride))
+    assert sampled_frames(count, most) == list(range(0, count, stride))
     assert thinned_rate(24.0, count, most) == pytest.approx(24.0 / stride)
 
 
 @pytest.mark.parametrize(("count", "most"), [(2, 2), (5, 2), (31, 16), (31, 32), (33, 32), (1000, 7)])
 def test_samples_are_distinct_and_hold_both_ends(count, most):
-    chosen = evenly_spaced(count, most)
+    chosen = sampled_frames(count, most)
     assert chosen == sorted(set(chosen)) and len(chosen) == min(count, most)
     assert chosen[0] == 0 and chosen[-1] == count - 1
 

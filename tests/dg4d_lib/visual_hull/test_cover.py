@@ -59,7 +59,7 @@ def test_matter_stays_inside_the_silhouette(wrong: list[KnownView]) -> None:
 def test_right_views_need_nothing() -> None:
     views = ring(MANY)
     whole = hull(views, CELLS, reach=REACH)
-    covered = covering(whole, views[0], NEARLY)
+    covered = covering(whole, views[0], NEARLY * whole.step)
     limit = TRUNCATION * whole.step
     assert np.abs(covered.values).max() <= np.float32(limit)
     assert (covered.values >= whole.values.clip(-limit, limit)).all()
