@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 BORDER = 0.02  # width of the ring that the model is fitted to, as a share of the longest side
 BORDER_DEGREE = 2  # degree of the polynomial fitted to the ring
@@ -25,6 +26,8 @@ SHADOW_DROP = 35.0  # maximum darkening by a shadow, L* units
 SHADOW_SLOPE = 1.6  # maximum lightness gradient of a shadow, L* per pixel; outlines are steeper
 MAX_SHADOW = 0.4  # maximum share of the foreground that may be shadow; beyond, it is a pale subject
 HOLE = 0.0006  # share of the subject; smaller spots of the backdrop's color are highlights, not gaps between limbs
+SPOTS = 8  # minimum number of small parts, in every frame, that are a pattern
+SPOTTED = 0.05  # their minimum area relative to the subject
 SAMPLES = 20000  # pixels per fit
 
 
@@ -89,15 +92,38 @@ def fit_backdrop(lab: Float[ndarray, "t h w 3"]) -> Backdrop:
     return refined if refined.is_plain and refined.share >= first.share - 0.05 else first
 
 
-def cut_out(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Bool[ndarray, "t h w"]:
-    """Segment the subject: pixels that the flood fill does not reach, without shadows, small holes filled."""
-    color = backdrop.color(*lab.shape[1:3])
-    return np.stack([_subject(frame - color, backdrop) for frame in lab])
+def cut_out(
+    lab: Float[ndarray, "t h w 3"], backdrop: Backdrop, pattern: Bool[ndarray, "t h w"] | None = None
+) -> Bool[ndarray, "t h w"]:
+    """Segment the subject: pixels that the flood fill does not reach, without shadows, small holes filled.
+
+    Args:
+        lab: frames.
+        backdrop: of them.
+        pattern: pixels in colors of a pattern on the backdrop; the flood fill passes them.
+    """
+    known = np.zeros(lab.shape[:3], bool) if pattern is None else pattern
+    plain = np.where(known[..., None], 0, lab - backdrop.color(*lab.shape[1:3]))
+    return np.stack([_subject(difference, backdrop) for difference in plain])
 
 
-def border_ring(height: int, width: int) -> Bool[ndarray, "h w"]:
-    """Mark the pixels along the edge of a frame."""
-    margin = max(2, round(BORDER * max(height, width)))
+def has_pattern(subject: Bool[ndarray, "t h w"], spots: Bool[ndarray, "t h w"]) -> bool:
+    """Return True if small parts beside a subject are so many that they are a pattern of the backdrop."""
+    counts = [ndimage.label(frame)[1] for frame in spots]
+    return min(counts) >= SPOTS and bool(spots.sum() >= SPOTTED * subject.sum())
+
+
+def colored_alike(lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"]) -> Bool[ndarray, "t h w"]:
+    """Mark all pixels that have the color of a marked one."""
+    colors = lab[where]
+    tree = KDTree(colors[:: max(1, len(colors) // SAMPLES)])
+    distance, _ = tree.query(lab.reshape(-1, 3), distance_upper_bound=TOLERANCE[0])
+    return np.asarray(np.isfinite(distance).reshape(where.shape))
+
+
+def border_ring(height: int, width: int, share: float = BORDER) -> Bool[ndarray, "h w"]:
+    """Mark the pixels along the edge of a frame, in a ring whose width is a share of the longest side."""
+    margin = max(2, round(share * max(height, width)))
     ring = np.ones((height, width), bool)
     ring[margin : height - margin, margin : width - margin] = False
     return ring

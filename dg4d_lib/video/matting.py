@@ -16,7 +16,8 @@ from torch import Tensor
 from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.video import u2netp
-from dg4d_lib.video.backdrop import Backdrop, border_ring, cut_out, fit_backdrop
+from dg4d_lib.video.backdrop import Backdrop, border_ring, colored_alike, cut_out, fit_backdrop, has_pattern
+from dg4d_lib.video.border_colors import missing_parts
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
 from dg4d_lib.video.segmentation_network import Segmentation
@@ -32,12 +33,14 @@ MIN_AREA = 0.005  # minimum share of the first frame that the subject covers
 MAX_AREA = 0.95  # maximum share of the first frame that the subject covers
 MAX_BORDER = 0.85  # maximum share of the border that the subject touches
 PART = 0.02  # minimum area of a part relative to the largest one; smaller parts are dropped
+PATTERN_KEEPS = 0.6  # minimum area of a subject without a pattern's colors, relative to the one with them
 AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
 BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
 BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
 TELLING = 0.92  # share of subject and background, on average, that their colors tell apart where colors are trusted
-SURE = {True: 0.07, False: 0.02}  # bound of the segmentation's log odds, as a probability, by trust in colors
+SURE = {True: 0.07, False: 0.012}  # bound of the segmentation's log odds, as a probability, by trust in colors
 COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
+PARTS_SIDE = 256  # longest side for the search of missing parts, pixels
 COLORS_SIDE = 128  # longest side for color models in all rounds but the last, pixels
 ROUNDS = {True: 4, False: 2}  # alternations of color models and segmentation, as in GrabCut, by trust in colors
 CROP_MARGIN = 0.12  # margin of the crop for the second segmentation, as a share of the subject's longest side
@@ -64,8 +67,9 @@ class Matte:
     Attributes:
         frames: cut-outs with straight alpha; colors are free of the background.
         method: segmentation method; all but "backdrop" are estimates that may be wrong.
-        agreement: overlap (IoU) with a second method in the worst checked frame; the network's answer to the mirrored
-            picture if there is no other one; None if there is none at all.
+        agreement: overlap (IoU) with a second method in the worst checked frame; if there is no other one, with the
+            network's answer to the mirrored picture and with its answer before colors completed it; None if there is
+            none at all.
         used_network: True if the result depends on the network's weights.
     """
 
@@ -218,7 +222,17 @@ def border_contact(masks: Bool[Tensor, "t h w"]) -> float:
 
 
 def _by_backdrop(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Float[Tensor, "t h w"]:
-    return torch.from_numpy(np.stack([_parts(mask, PART) for mask in cut_out(lab, backdrop)])).float()
+    subject, spots = _without_spots(cut_out(lab, backdrop))
+    if has_pattern(subject, spots):
+        again, _ = _without_spots(cut_out(lab, backdrop, colored_alike(lab, spots)))
+        subject = again if again.sum() >= PATTERN_KEEPS * subject.sum() else subject
+    return torch.from_numpy(subject).float()
+
+
+def _without_spots(masks: Bool[ndarray, "t h w"]) -> tuple[Bool[ndarray, "t h w"], Bool[ndarray, "t h w"]]:
+    """Return the large parts of masks, and the small ones."""
+    kept = np.stack([_parts(mask, PART) for mask in masks])
+    return kept, masks & ~kept
 
 
 def _by_network(
@@ -237,8 +251,20 @@ def _by_network(
         agreement = min(agreement, overlap(found[i] > 0.5, mirrored > 0.5))
         if len(frames) == 1:
             found = (found + mirrored) / 2
-            found = (2 * found + _closer(frames[0], found[0], network)) / 3
-    return _Segmentation(found, "network", agreement, True)
+    completed = _complete(frames, found)
+    agreement = min(agreement, overlap(found > 0.5, completed > 0.5))
+    if len(frames) == 1:
+        completed = _complete(frames, (2 * completed + _closer(frames[0], completed[0], network)) / 3)
+    return _Segmentation(completed, "network", agreement, True)
+
+
+def _complete(frames: Float[Tensor, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
+    """Return a segmentation with the parts that it misses, found by colors that the border of the frames lacks."""
+    lab = _lab(frames, PARTS_SIDE)
+    segmented = resize_planes(found[None], lab.shape[1:3])[0].numpy() > 0.5
+    segmented &= segmented.mean((1, 2), keepdims=True) >= MIN_AREA
+    missing = torch.from_numpy(missing_parts(lab, segmented)).float()
+    return torch.maximum(found, FUSED * resize_planes(missing[None], found.shape[1:])[0].clamp(0, 1))
 
 
 def _closer(

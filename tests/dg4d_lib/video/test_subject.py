@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from skimage import data
 from torch import Tensor
 
@@ -97,13 +98,13 @@ def test_a_filled_frame_says_that_it_has_no_outline():
     assert any("no outline" in note for note in notes)
 
 
-def small_disc(side: int, radius: int, column: int) -> Tensor:
+def small_disc(side: int, radius: int, column: int, blur: float = 0.0) -> Tensor:
     """Opaque picture of a disc with a pattern of 3 x 3 pixels before white, "1 side side 4"."""
     rows, columns = np.mgrid[:side, :side]
     dark = ((columns // 3 + rows // 3) % 2)[..., None]
     pattern = np.where(dark, (0.1, 0.1, 0.5), (0.9, 0.1, 0.1))
     inside = np.hypot(rows - side // 2, columns - column) < radius
-    picture = np.where(inside[..., None], pattern, 1.0)
+    picture = ndimage.gaussian_filter(np.where(inside[..., None], pattern, 1.0), (blur, blur, 0))
     return torch.from_numpy(np.dstack([picture, np.ones((side, side))])[None]).float()
 
 
@@ -163,8 +164,11 @@ class Forgetful:
 
 
 def test_a_subject_that_is_not_found_again_from_close_is_kept_with_a_note():
+    """Its outline is blurred, so that its colors do not give it away either."""
     network = Forgetful()
     settings = SubjectSettings(size=64, matting="u2netp")
-    prepared = prepare_subject(small_disc(512, 32, 300), False, settings, segmenter=Segmenter("dark", lambda: network))
+    prepared = prepare_subject(
+        small_disc(512, 32, 300, 14), False, settings, segmenter=Segmenter("dark", lambda: network)
+    )
     assert network.calls > 3 and COARSE in prepared.notes
     assert prepared.frame == (128, 128)

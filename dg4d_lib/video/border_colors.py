@@ -1,0 +1,82 @@
+"""Parts of a subject that a segmentation misses: sharply outlined, in colors that the border of the frames lacks."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from dg4d_lib.video.backdrop import border_ring
+
+RING = 0.05  # width of the ring whose colors count as background, as a share of the longest side
+SAMPLES = 20000  # colors of the ring
+NEIGHBOR = 4  # distances are those to the fourth nearest color: one speck in the ring is no evidence
+TOLERANCE = 2.5, 12.0  # minimum and maximum distance from which a color is none of the ring's, Lab units
+KNOWN_SHARE = 0.98  # share of one half of the ring's colors that the tolerance to the other half covers
+DISTANCE = 3.0  # minimum median distance of a part's colors, in tolerances
+CONTRAST = 10.0  # minimum median gradient along a part's outline, Lab units per pixel; shadows and clouds are softer
+OUTLINE = 2  # width of the band around the segmentation that is left to its refinement, pixels
+MAX_ADDED = 2.0  # maximum area of all parts relative to the segmentation
+LARGE = 0.25  # minimum area of a part relative to the largest one, where nothing was segmented
+SQUARE = np.ones((3, 3), bool)  # a pixel and its neighbors
+
+
+def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"]) -> Bool[ndarray, "t h w"]:
+    """Mark parts of the subject that are missing in a segmentation.
+
+    Args:
+        lab: frames in CIE Lab.
+        found: segmentation.
+
+    Returns:
+        Pixels to add: parts that touch the segmentation, or the largest parts if it is empty in all frames. None in
+        frames where they are more than twice its area.
+    """
+    height, width = lab.shape[1:3]
+    colors = lab[:, border_ring(height, width, RING)].reshape(-1, 3)
+    colors = colors[:: max(1, len(colors) // SAMPLES)]
+    to_other_half = _distance(KDTree(colors[::2]), colors[1::2])
+    tolerance = float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE))
+    tree, seeded = KDTree(colors), bool(found.any())
+    return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
+
+
+def _missing(
+    lab: Float[ndarray, "h w 3"], found: Bool[ndarray, "h w"], tree: KDTree, tolerance: float, seeded: bool
+) -> Bool[ndarray, "h w"]:
+    """Mark the missing parts of one frame.
+
+    Args:
+        lab: frame.
+        found: segmentation.
+        tree: colors of the ring.
+        tolerance: distance from which a color is none of the ring's.
+        seeded: True to mark parts that touch the segmentation, False to mark the largest parts.
+    """
+    distance = np.zeros(found.shape)
+    distance[~found] = _distance(tree, lab[~found])
+    unlike = ndimage.binary_opening(distance > tolerance, SQUARE[:2, :2])
+    beside = unlike & ~ndimage.binary_dilation(found, iterations=OUTLINE)
+    if seeded:
+        joined, _ = ndimage.label(unlike | found, SQUARE)
+        beside &= np.isin(joined, np.unique(joined[found]))
+    parts, count = ndimage.label(beside, SQUARE)
+    if not count:
+        return beside
+    numbers = np.arange(1, count + 1)
+    outline = np.where(ndimage.binary_erosion(unlike | found, border_value=1), 0, parts)
+    slope = np.linalg.norm([ndimage.gaussian_gradient_magnitude(lab[..., c], 0.7) for c in range(3)], axis=0)
+    sharp = np.nan_to_num(ndimage.median(ndimage.maximum_filter(slope, 3), outline, numbers)) >= CONTRAST
+    fitting = sharp & (ndimage.median(distance, parts, numbers) >= DISTANCE * tolerance)
+    if not seeded:
+        areas = ndimage.sum_labels(beside, parts, numbers) * fitting
+        return np.isin(parts, numbers[fitting & (areas >= LARGE * areas.max())])
+    kept = np.isin(parts, numbers[fitting])
+    added = kept | (ndimage.binary_dilation(kept, iterations=OUTLINE + 1) & unlike)
+    return added if added.sum() <= MAX_ADDED * found.sum() else np.zeros_like(found)
+
+
+def _distance(tree: KDTree, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:
+    """Return the distance of colors to the fourth nearest one of a tree, Lab units."""
+    distances, _ = tree.query(colors, k=[NEIGHBOR])
+    return np.asarray(distances)[:, 0]
