@@ -254,7 +254,8 @@ def _by_network(
     completed = _complete(frames, found)
     agreement = min(agreement, overlap(found > 0.5, completed > 0.5))
     if len(frames) == 1:
-        completed = _complete(frames, (2 * completed + _closer(frames[0], completed[0], network)) / 3)
+        mean = (2 * completed + _closer(frames[0], completed[0], network)) / 3
+        completed = _complete(frames, mean)
     return _Segmentation(completed, "network", agreement, True)
 
 
