@@ -54,6 +54,12 @@ SMALL: dict[str, Any] = {  # the paper's schedule scaled to seconds on a CPU: fe
     "motion.plane_lr": 0.0128,
     "motion.network_lr": 0.00128,
 }
+SIZES = {
+    "seeds": "fits of every variant and object",
+    "frames": "largest number of frames",
+    "size": "pixels of the fits and of our own objects' views",
+}
+FULL, SMOKE = {"seeds": 2, "frames": 16, "size": 96}, {"seeds": 1, "frames": 4, "size": 48}
 QUICK: dict[str, Any] = {"static.iterations": 30, "static.start.points": 500, "motion.iterations": 10}
 IMPERFECT: dict[str, Any] = {"prior.blur": 1.0, "prior.color_gain": 0.2, "prior.pose_deg": 4.0, "prior.shift": 1.5}
 FINE: dict[str, Any] = {"deformation.scales": [1, 4]}
@@ -401,9 +407,9 @@ def main() -> None:
         f"stage ({', '.join(name for name, one in ABLATIONS.items() if one.still)}), which take pictures, too; "
         "those of the refinement: experiments.oracle_refinement, and with weights benchmarks.refinement",
     )
-    parser.add_argument("--seeds", type=int, default=2, help="fits of every variant and object")
-    parser.add_argument("--frames", type=int, default=16, help="largest number of frames")
-    parser.add_argument("--size", type=int, default=96, help="pixels of the fits and of our own objects' views")
+    for name, about in SIZES.items():
+        help_text = f"{about}; default: {FULL[name]}, with --quick {SMOKE[name]}"
+        parser.add_argument(f"--{name}", type=int, default=None, metavar="N", help=help_text)
     parser.add_argument("--imperfect", action="store_true", help="perturb the oracle")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of all variants")
     options = parser.parse_args()
@@ -420,11 +426,11 @@ def run(options: argparse.Namespace, console: Console) -> None:
         BadInput: a data set, an object, a number, a setting or a prior's weights cannot be used.
         BackendUnavailable: the prior's weights are not installed.
     """
-    for name in ("seeds", "frames", "size"):
+    for name, default in (SMOKE if options.quick else FULL).items():
+        if getattr(options, name) is None:
+            setattr(options, name, default)
         if (value := getattr(options, name)) < 1:
             raise BadInput(f"--{name} is {value}; give at least 1")
-    if options.quick:
-        options.seeds, options.frames, options.size = 1, 4, 48
     base = {
         **(QUICK if options.quick else {}),
         **(IMPERFECT if options.imperfect else {}),

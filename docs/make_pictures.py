@@ -6,10 +6,12 @@
 The screenshot needs the server of that run, Node.js and Chromium; with --screenshot nothing else is made.
 """
 
+import argparse
 import json
 import math
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +35,16 @@ FPS, SWAY_DEG, LOOPS = 12, 35.0, 2
 QUALITY = 72
 
 
-def main(arguments: list[str]) -> None:
-    """Write the animation of a package and, where its server runs, the screenshot."""
-    package = Path(arguments[0])
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the animation of a package, then the screenshot."""
+    parser = argparse.ArgumentParser(prog="python docs/make_pictures.py", description=main.__doc__)
+    parser.add_argument("package", type=Path, help="folder of an asset whose run the background server knows")
+    parser.add_argument("--screenshot", action="store_true", help="the screenshot only")
+    options = parser.parse_args(arguments)
     IMAGES.mkdir(exist_ok=True)
-    if "--screenshot" not in arguments:
-        write_animation(package, IMAGES / "demo.webp")
-    write_screenshot(package, IMAGES / "prefect.png")
+    if not options.screenshot:
+        write_animation(options.package, IMAGES / "demo.webp")
+    write_screenshot(options.package, IMAGES / "prefect.png")
 
 
 def write_animation(package: Path, path: Path) -> None:
@@ -107,4 +112,4 @@ def _bytes(picture: Float[Tensor, "h w 3"]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

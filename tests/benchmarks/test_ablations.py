@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import NoReturn
 
 import pytest
 import torch
@@ -247,6 +248,22 @@ def test_objects_may_stand_before_the_names_of_ablations_as_in_the_usage(monkeyp
     monkeypatch.setattr(ablations, "run", lambda options, console: given.append(options))
     called(monkeypatch, "--objects", "newt,parrot", "static", "noise")
     assert given[0].objects == ["newt", "parrot"] and given[0].names == ["static", "noise"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sizes"), [([], (16, 96)), (["--quick"], (4, 48)), (["--quick", "--size=32"], (4, 32))]
+)
+def test_given_sizes_go_before_those_of_a_smoke_test(words, sizes, monkeypatch):
+    asked = []
+
+    def find(data: None, names: None, frames: int, size: int) -> NoReturn:
+        asked.append((frames, size))
+        raise BadInput("enough")
+
+    monkeypatch.setattr(ablations, "find_specimens", find)
+    with pytest.raises(SystemExit):
+        called(monkeypatch, "static", *words)
+    assert asked == [sizes]
 
 
 @pytest.mark.parametrize("base", [{}, QUICK, {"static.iterations": 500, "motion.iterations": 200}])
