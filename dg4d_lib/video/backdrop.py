@@ -102,9 +102,11 @@ def cut_out(
         backdrop: of them.
         pattern: pixels in colors of a pattern on the backdrop; the flood fill passes them.
     """
-    known = np.zeros(lab.shape[:3], bool) if pattern is None else pattern
-    plain = np.where(known[..., None], 0, lab - backdrop.color(*lab.shape[1:3]))
-    return np.stack([_subject(difference, backdrop) for difference in plain])
+    color = backdrop.color(*lab.shape[1:3])
+    differences = (frame - color for frame in lab)
+    if pattern is not None:
+        differences = (np.where(known[..., None], 0, one) for one, known in zip(differences, pattern, strict=True))
+    return np.stack([_subject(difference, backdrop) for difference in differences])
 
 
 def has_pattern(subject: Bool[ndarray, "t h w"], spots: Bool[ndarray, "t h w"]) -> bool:
@@ -116,9 +118,9 @@ def has_pattern(subject: Bool[ndarray, "t h w"], spots: Bool[ndarray, "t h w"]) 
 def colored_alike(lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"]) -> Bool[ndarray, "t h w"]:
     """Mark all pixels that have the color of a marked one."""
     colors = lab[where]
-    tree = KDTree(colors[:: max(1, len(colors) // SAMPLES)])
-    distance, _ = tree.query(lab.reshape(-1, 3), distance_upper_bound=TOLERANCE[0])
-    return np.asarray(np.isfinite(distance).reshape(where.shape))
+    tree = KDTree(np.unique(colors[:: max(1, len(colors) // SAMPLES)], axis=0))
+    distances = (tree.query(frame, distance_upper_bound=TOLERANCE[0])[0] for frame in lab)
+    return np.stack([np.isfinite(distance) for distance in distances])
 
 
 def border_ring(height: int, width: int, share: float = BORDER) -> Bool[ndarray, "h w"]:

@@ -35,9 +35,9 @@ def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"])
     height, width = lab.shape[1:3]
     colors = lab[:, border_ring(height, width, RING)].reshape(-1, 3)
     colors = colors[:: max(1, len(colors) // SAMPLES)]
-    to_other_half = _distance(KDTree(colors[::2]), colors[1::2])
+    to_other_half = _distance(_tree(colors[::2]), colors[1::2])
     tolerance = float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE))
-    tree, seeded = KDTree(colors), bool(found.any())
+    tree, seeded = _tree(colors), bool(found.any())
     return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
 
 
@@ -74,6 +74,12 @@ def _missing(
     kept = np.isin(parts, numbers[fitting])
     added = kept | (ndimage.binary_dilation(kept, iterations=OUTLINE + 1) & unlike)
     return added if added.sum() <= MAX_ADDED * found.sum() else np.zeros_like(found)
+
+
+def _tree(colors: Float[ndarray, "p 3"]) -> KDTree:
+    """Return a tree of colors; of equal ones, which are slow to search, as many as count."""
+    distinct, counts = np.unique(colors, axis=0, return_counts=True)
+    return KDTree(np.repeat(distinct, np.minimum(counts, NEIGHBOR), axis=0))
 
 
 def _distance(tree: KDTree, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:

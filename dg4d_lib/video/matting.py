@@ -252,7 +252,7 @@ def _by_network(
         if len(frames) == 1:
             found = (found + mirrored) / 2
     completed = _complete(frames, found)
-    agreement = min(agreement, overlap(found > 0.5, completed > 0.5))
+    agreement = min(agreement, *(overlap(a > 0.5, b > 0.5) for a, b in zip(found, completed, strict=True)))
     if len(frames) == 1:
         mean = (2 * completed + _closer(frames[0], completed[0], network)) / 3
         completed = _complete(frames, mean)
