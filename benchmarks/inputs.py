@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from benchmarks import matting, own_asset
-from benchmarks.measure import new_console, parser_of
+from benchmarks.measure import new_console, parser_of, write_rows
 from benchmarks.true_views import SIZE, Figures, Subject, figures, line, mean, prepared, read_subjects, score_fit
 
 import torch  # isort: skip
@@ -150,7 +150,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             given.json.write_text(json.dumps(measured, indent=1))
         return
     if given.matting:
-        new_console().print(matting.table(matting.measure_matting(given.matting, objects=given.only)))
+        rows = matting.measure_matting(given.matting, objects=given.only)
+        new_console().print(matting.table(rows))
+        if given.json:
+            write_rows(given.json, rows)
         return
     name = next(name for name in WAYS if getattr(given, name))
     settings = revise(PREVIEW, changes)

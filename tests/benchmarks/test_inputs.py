@@ -37,6 +37,15 @@ def test_pictures_of_other_sides_beat_the_video_alone(objects, tmp_path):
     assert overlaps["views"] > max(0.85, overlaps["none"] + 0.1)
 
 
+def test_cut_outs_are_scored_over_all_backdrops_and_written(objects, tmp_path, capsys):
+    out = tmp_path / "rows.json"
+    inputs.main(["--matting", str(objects), "--json", str(out)])
+    rows = json.loads(out.read_text())["rows"]
+    assert len({row["backdrop"] for row in rows}) == len(rows) == 32
+    assert next(row["iou"] for row in rows if row["backdrop"] == "green screen") > 0.9
+    assert "procedural: mean" in capsys.readouterr().out
+
+
 def test_one_way_must_be_chosen(objects):
     with pytest.raises(SystemExit):
         inputs.main(["--views", str(objects), "--none", str(objects)])
