@@ -26,9 +26,7 @@ from dg4d_lib.mesh.models.control_graph import ControlGraph, symmetric_matrix
 from dg4d_lib.rasterizer.interface import Rasterizer
 
 SIZE = 64  # pixels of the compared pictures, at most
-RENDERED = 1000  # number of Gaussians, about, if they show the first frame as well as all of them
-AS_WELL = 2.0  # error of the first frame up to which they do, relative to that of all
-SLIGHT = 0.005  # error of the first frame, mean square, up to which they do in any case
+RENDERED = 1000  # largest number of Gaussians, about
 BATCH = 64  # pictures at once
 LEVELS = 3  # of the image pyramid
 BRANCHES = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of the distance from the middle where branches begin
@@ -93,18 +91,19 @@ class PartSearch:
     ) -> None:
         """Store the model and the frames.
 
-        Of Gaussians that are spread evenly over a surface, a thousand show it; of Gaussians that were fitted to a
-        frame, more are kept.
-
         Args:
-            cloud: Gaussians of the model at rest, about as in the first frame.
+            cloud: Gaussians of the model at rest.
             graph: control graph whose points are the Gaussians.
             pictures: frames over the backdrop.
             alphas: of the frames.
             backdrop: its gray value.
             rasterize: rasterizer.
         """
-        self._rasterize = rasterize
+        step = -(-len(cloud) // RENDERED)
+        thin = thinned(cloud, step)
+        sizes = thin.log_scales.mean(-1, keepdim=True).expand(-1, 3)
+        self._cloud = replace(thin, log_scales=sizes)  # round, for they are not turned
+        self._graph, self._rasterize = graph.of(torch.arange(0, len(cloud), step)), rasterize
         size = min(SIZE, pictures.shape[1])
         self._camera = replace(OrbitCamera(), width=size, height=size)
         self._backdrop = pictures.new_full((3,), backdrop)
@@ -113,26 +112,16 @@ class PartSearch:
         self._nodes = graph.nodes.double().numpy()
         self._parts = find_parts(graph)
         self._turns = np.concatenate([_rotations_by(angle) for angle in ANGLES])
-        step = -(-len(cloud) // RENDERED)
-        enough = max(SLIGHT, AS_WELL * self._take(cloud, graph, 1))
-        while self._take(cloud, graph, step) > enough and step > 1:
-            step = -(-step // 2)
-
-    def _take(self, cloud: Gaussians, graph: ControlGraph, step: int) -> float:
-        """Keep every `step`-th Gaussian, enlarged; return the error of the first frame at rest."""
-        thin = thinned(cloud, step)
-        sizes = thin.log_scales.mean(-1, keepdim=True).expand(-1, 3)
-        self._cloud = replace(thin, log_scales=sizes)  # round, for they are not turned
-        self._graph = graph.of(torch.arange(0, len(cloud), step))
-        return self._error(Pose.rest(len(self._nodes)), 0)
 
     def best_pose(self, pose: Pose, frame: int) -> Pose:
         """Return the pose after up to `ROUNDS` parts were turned; the same object if no part lowers the error."""
-        first = best = self._error(pose, frame)
+        everything = np.ones(len(self._nodes), bool)
+        still = _Hinge(everything, self._nodes.mean(0), np.eye(3))
+        first = best = float(self._errors(self._shares(pose), frame, still, np.eye(3)[None])[0])
         for _ in range(ROUNDS):
             places = self._nodes + pose.shifts
             costs_of = partial(self._costs, self._shares(pose), frame, first)
-            hinges = [_all_of(places), *(_hinge(part, places) for part in self._parts)]
+            hinges = [replace(still, center=places.mean(0)), *(_hinge(part, places) for part in self._parts)]
             costs = [costs_of(hinge, self._turns) for hinge in hinges]
             promising = np.argsort([cost.min() for cost in costs], kind="stable")[:REFINED]
             refined = [
@@ -171,10 +160,6 @@ class PartSearch:
         index, weights = self._graph.indices.numpy(), self._graph.weights.double().numpy()
         return pose.shares(self._cloud.means.double().numpy(), self._nodes, index, weights)[0]
 
-    def _error(self, pose: Pose, frame: int) -> float:
-        """Return the difference of a render and a frame."""
-        return float(self._errors(self._shares(pose), frame, _all_of(self._nodes), np.eye(3)[None])[0])
-
     @torch.no_grad()
     def _errors(
         self, shares: Float[np.ndarray, "n k 3"], frame: int, hinge: _Hinge, turns: Float[np.ndarray, "b 3 3"]
@@ -210,11 +195,6 @@ def _refine_rotation(
         costs = costs_of(near)
         best, turn = float(costs.min()), near[int(costs.argmin())]
     return best, turn
-
-
-def _all_of(places: Float[np.ndarray, "m 3"]) -> _Hinge:
-    """Return the whole model as a part that turns about its center."""
-    return _Hinge(np.ones(len(places), bool), places.mean(0), np.eye(3))
 
 
 def _hinge(part: Part, places: Float[np.ndarray, "m 3"]) -> _Hinge:
