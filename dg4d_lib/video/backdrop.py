@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree
 
 BORDER = 0.02  # width of the ring that the model is fitted to, as a share of the longest side
 BORDER_DEGREE = 2  # degree of the polynomial fitted to the ring
@@ -118,7 +118,7 @@ def has_pattern(subject: Bool[ndarray, "t h w"], spots: Bool[ndarray, "t h w"]) 
 def colored_alike(lab: Float[ndarray, "t h w 3"], where: Bool[ndarray, "t h w"]) -> Bool[ndarray, "t h w"]:
     """Mark all pixels that have the color of a marked one."""
     colors = lab[where]
-    tree = KDTree(np.unique(colors[:: max(1, len(colors) // SAMPLES)], axis=0))
+    tree = cKDTree(np.unique(colors[:: max(1, len(colors) // SAMPLES)], axis=0))
     distances = (tree.query(frame, distance_upper_bound=TOLERANCE[0])[0] for frame in lab)
     return np.stack([np.isfinite(distance) for distance in distances])
 

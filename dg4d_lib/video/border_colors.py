@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree
 
 from dg4d_lib.video.backdrop import border_ring
 
@@ -12,7 +12,7 @@ RING = 0.05  # width of the ring whose colors count as background, as a share of
 SAMPLES = 20000  # colors of the ring
 NEIGHBOR = 4  # distances are those to the fourth nearest color: one speck in the ring is no evidence
 TOLERANCE = 2.5, 12.0  # minimum and maximum distance from which a color is none of the ring's, Lab units
-KNOWN_SHARE = 0.98  # share of one half of the ring's colors that the tolerance to the other half covers
+KNOWN_SHARE = 0.98  # share of one half of the ring's colors that lie within the tolerance of the other half
 DISTANCE = 2.6  # minimum median distance of a part's colors, in tolerances
 CONTRAST = 7.0  # minimum median gradient along a part's outline, Lab units per pixel; shadows and clouds are softer
 OUTLINE = 2  # width of the band around the segmentation that is left to its refinement, pixels
@@ -42,7 +42,7 @@ def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"])
 
 
 def _missing(
-    lab: Float[ndarray, "h w 3"], found: Bool[ndarray, "h w"], tree: KDTree, tolerance: float, seeded: bool
+    lab: Float[ndarray, "h w 3"], found: Bool[ndarray, "h w"], tree: cKDTree, tolerance: float, seeded: bool
 ) -> Bool[ndarray, "h w"]:
     """Mark the missing parts of one frame.
 
@@ -76,13 +76,13 @@ def _missing(
     return added if added.sum() <= MAX_ADDED * found.sum() else np.zeros_like(found)
 
 
-def _tree(colors: Float[ndarray, "p 3"]) -> KDTree:
+def _tree(colors: Float[ndarray, "p 3"]) -> cKDTree:
     """Return a tree of colors; of equal ones, which are slow to search, as many as count."""
     distinct, counts = np.unique(colors, axis=0, return_counts=True)
-    return KDTree(np.repeat(distinct, np.minimum(counts, NEIGHBOR), axis=0))
+    return cKDTree(np.repeat(distinct, np.minimum(counts, NEIGHBOR), axis=0))
 
 
-def _distance(tree: KDTree, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:
+def _distance(tree: cKDTree, colors: Float[ndarray, "p 3"]) -> Float[ndarray, " p"]:
     """Return the distance of colors to the fourth nearest one of a tree, Lab units."""
     distances, _ = tree.query(colors, k=[NEIGHBOR])
     return np.asarray(distances)[:, 0]

@@ -251,17 +251,17 @@ def _by_network(
         agreement = min(agreement, overlap(found[i] > 0.5, mirrored > 0.5))
         if len(frames) == 1:
             found = (found + mirrored) / 2
-    completed = _complete(frames, found)
+    lab = _lab(frames, PARTS_SIDE)
+    completed = _complete(lab, found)
     agreement = min(agreement, *(overlap(a > 0.5, b > 0.5) for a, b in zip(found, completed, strict=True)))
     if len(frames) == 1:
         mean = (2 * completed + _closer(frames[0], completed[0], network)) / 3
-        completed = _complete(frames, mean)
+        completed = _complete(lab, mean)
     return _Segmentation(completed, "network", agreement, True)
 
 
-def _complete(frames: Float[Tensor, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
+def _complete(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
     """Return a segmentation with the parts that it misses, found by colors that the border of the frames lacks."""
-    lab = _lab(frames, PARTS_SIDE)
     segmented = resize_planes(found[None], lab.shape[1:3])[0].numpy() > 0.5
     segmented &= segmented.mean((1, 2), keepdims=True) >= MIN_AREA
     missing = torch.from_numpy(missing_parts(lab, segmented)).float()
