@@ -1,5 +1,7 @@
 """Parts of a subject that a segmentation misses: sharply outlined, in colors that the border of the frames lacks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
@@ -32,13 +34,30 @@ def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"])
         Pixels to add: parts that touch the segmentation, or the largest parts if it is empty in all frames. None in
         frames where they are more than twice its area.
     """
+    tree, tolerance = _border_colors(lab)
+    seeded = bool(found.any())
+    return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
+
+
+def unlike_border(lab: Float[ndarray, "t h w 3"], frames: Sequence[int]) -> Bool[ndarray, "k h w"]:
+    """Mark the pixels of some frames whose colors are none of those along the border of all frames.
+
+    Args:
+        lab: frames in CIE Lab.
+        frames: numbers of those to mark.
+    """
+    tree, tolerance = _border_colors(lab)
+    shape = lab.shape[1:3]
+    return np.stack([_distance(tree, lab[frame].reshape(-1, 3)).reshape(shape) > tolerance for frame in frames])
+
+
+def _border_colors(lab: Float[ndarray, "t h w 3"]) -> tuple[cKDTree, float]:
+    """Return the colors of the ring of all frames, and the distance from which a color is none of them."""
     height, width = lab.shape[1:3]
     colors = lab[:, border_ring(height, width, RING)].reshape(-1, 3)
     colors = colors[:: max(1, len(colors) // SAMPLES)]
     to_other_half = _distance(_tree(colors[::2]), colors[1::2])
-    tolerance = float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE))
-    tree, seeded = _tree(colors), bool(found.any())
-    return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
+    return _tree(colors), float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE))
 
 
 def _missing(

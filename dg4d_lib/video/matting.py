@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.backdrop import Backdrop, border_ring, colored_alike, cut_out, fit_backdrop, has_pattern
-from dg4d_lib.video.border_colors import missing_parts
+from dg4d_lib.video.border_colors import missing_parts, unlike_border
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
 from dg4d_lib.video.segmentation_network import Segmentation
@@ -68,8 +68,8 @@ class Matte:
         frames: cut-outs with straight alpha; colors are free of the background.
         method: segmentation method; all but "backdrop" are estimates that may be wrong.
         agreement: overlap (IoU) with a second method in the worst checked frame; if there is no other one, with the
-            network's answer to the mirrored picture and with its answer before colors completed it; None if there is
-            none at all.
+            network's answer to the mirrored picture, and before colors completed it with its answer or with these
+            colors alone; None if there is none at all.
         used_network: True if the result depends on the network's weights.
     """
 
@@ -253,7 +253,7 @@ def _by_network(
             found = (found + mirrored) / 2
     lab = _lab(frames, PARTS_SIDE)
     completed = _complete(lab, found)
-    agreement = min(agreement, *(overlap(a > 0.5, b > 0.5) for a, b in zip(found, completed, strict=True)))
+    agreement = min(agreement, _agreement_of_completed(lab, found > 0.5, completed > 0.5))
     if len(frames) == 1:
         mean = (2 * completed + _closer(frames[0], completed[0], network)) / 3
         completed = _complete(lab, mean)
@@ -266,6 +266,29 @@ def _complete(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -
     segmented &= segmented.mean((1, 2), keepdims=True) >= MIN_AREA
     missing = torch.from_numpy(missing_parts(lab, segmented)).float()
     return torch.maximum(found, FUSED * resize_planes(missing[None], found.shape[1:])[0].clamp(0, 1))
+
+
+def _agreement_of_completed(
+    lab: Float[ndarray, "t h w 3"], found: Bool[Tensor, "t h2 w2"], completed: Bool[Tensor, "t h2 w2"]
+) -> float:
+    """Return the overlap of a completed segmentation with the network's, in the frame in which it is smallest.
+
+    Where colors that the border lacks overlap with it more, these count: they also confirm what the network found.
+    Where it found nothing, they are the only method, and nothing agrees with them.
+
+    Args:
+        lab: frames.
+        found: segmentation by the network.
+        completed: with the parts that it misses.
+    """
+    overlaps = [overlap(one, other) for one, other in zip(found, completed, strict=True)]
+    changed = [i for i, value in enumerate(overlaps) if value < AGREED and found[i].float().mean() >= MIN_AREA]
+    if changed:
+        unlike = torch.from_numpy(unlike_border(lab, changed)).float()
+        by_color = resize_planes(unlike[None], completed.shape[1:])[0] > 0.5
+        for i, mask in zip(changed, by_color, strict=True):
+            overlaps[i] = max(overlaps[i], overlap(mask, completed[i]))
+    return min(overlaps)
 
 
 def _closer(
