@@ -20,6 +20,13 @@ CONTRAST = 7.0  # minimum median gradient along a part's outline, Lab units per 
 OUTLINE = 2  # width of the band around the segmentation that is left to its refinement, pixels
 MAX_ADDED = 2.0  # maximum area of all parts relative to the segmentation
 LARGE = 0.25  # minimum area of a part relative to the largest one, where nothing was segmented
+SURE = (
+    0.05,
+    0.8,
+)  # probabilities below and above which a pixel serves to learn how often colors are none of the border's
+FEWEST = 50  # number of such pixels of subject and background each from which they tell
+RAREST = 0.1  # bound of both shares: U2-Netp is surer than it is right
+LIKE_SHARE = 0.5  # weight of colors that the border has: subjects have patches of them
 SQUARE = np.ones((3, 3), bool)  # a pixel and its neighbors
 
 
@@ -37,6 +44,30 @@ def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"])
     tree, tolerance = _border_colors(lab)
     seeded = bool(found.any())
     return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
+
+
+def color_evidence(lab: Float[ndarray, "t h w 3"], probability: Float[ndarray, "t h w"]) -> Float[ndarray, "t h w"]:
+    """Return log likelihood ratios of subject and background by whether the border has the color of a pixel.
+
+    How often it has not is learned where a segmentation is sure, frame by frame; where subject and background do not
+    differ so, the ratios are 0.
+
+    Args:
+        lab: frames in CIE Lab.
+        probability: of the subject.
+    """
+    evidence = np.zeros(probability.shape)
+    for frame, (mask, known) in enumerate(zip(unlike_border(lab, range(len(lab))), probability, strict=True)):
+        unlike = ndimage.binary_opening(mask, SQUARE[:2, :2])
+        subject, background = unlike[known > SURE[1]], unlike[known < SURE[0]]
+        if min(len(subject), len(background)) < FEWEST:
+            continue
+        of_subject, of_background = np.clip([subject.mean(), background.mean()], RAREST, 1 - RAREST)
+        if of_subject > of_background:
+            like = ~ndimage.binary_dilation(mask, SQUARE)  # thin parts and outlines are neither
+            against = LIKE_SHARE * np.log((1 - of_subject) / (1 - of_background))
+            evidence[frame] = unlike * np.log(of_subject / of_background) + like * against
+    return evidence
 
 
 def unlike_border(lab: Float[ndarray, "t h w 3"], frames: Sequence[int]) -> Bool[ndarray, "k h w"]:

@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.backdrop import Backdrop, border_ring, colored_alike, cut_out, fit_backdrop, has_pattern
-from dg4d_lib.video.border_colors import missing_parts, unlike_border
+from dg4d_lib.video.border_colors import color_evidence, missing_parts, unlike_border
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
 from dg4d_lib.video.segmentation_network import Segmentation
@@ -45,6 +45,7 @@ COLORS_SIDE = 128  # longest side for color models in all rounds but the last, p
 ROUNDS = {True: 4, False: 2}  # alternations of color models and segmentation, as in GrabCut, by trust in colors
 CROP_MARGIN = 0.12  # margin of the crop for the second segmentation, as a share of the subject's longest side
 CROP_SURE = 0.3  # probability from which a pixel counts for the crop
+UNSURE = 0.005  # bound of the segmentation's probabilities before the evidence of colors
 FUSED = 0.9  # probability of pixels that differ from an even backdrop
 CLEAN_SHARE = 0.98  # minimum share of the border that an even backdrop and the subject explain
 ISLANDS = 0.05  # maximum area of other objects before an even backdrop, relative to the subject
@@ -68,7 +69,7 @@ class Matte:
         frames: cut-outs with straight alpha; colors are free of the background.
         method: segmentation method; all but "backdrop" are estimates that may be wrong.
         agreement: overlap (IoU) with a second method in the worst checked frame; if there is no other one, with the
-            network's answer to the mirrored picture, and before colors completed it with its answer or with these
+            network's answer to the mirrored picture, and, before colors changed it, with its answer or with these
             colors alone; None if there is none at all.
         used_network: True if the result depends on the network's weights.
     """
@@ -252,12 +253,19 @@ def _by_network(
         if len(frames) == 1:
             found = (found + mirrored) / 2
     lab = _lab(frames, PARTS_SIDE)
-    completed = _complete(lab, found)
+    completed = _complete(lab, _weigh_colors(lab, found))
     agreement = min(agreement, _agreement_of_completed(lab, found > 0.5, completed > 0.5))
     if len(frames) == 1:
-        mean = (2 * completed + _closer(frames[0], completed[0], network)) / 3
-        completed = _complete(lab, mean)
+        closer = _weigh_colors(lab, _closer(frames[0], completed[0], network)[None])
+        completed = _complete(lab, (2 * completed + closer) / 3)
     return _Segmentation(completed, "network", agreement, True)
+
+
+def _weigh_colors(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
+    """Return a segmentation with the evidence of colors that the border of the frames lacks."""
+    evidence = torch.from_numpy(color_evidence(lab, resize_planes(found[None], lab.shape[1:3])[0].double().numpy()))
+    odds = torch.logit(found.double(), UNSURE) + resize_planes(evidence[None], found.shape[1:])[0]
+    return odds.sigmoid().to(found)
 
 
 def _complete(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.backdrop import fit_backdrop
-from dg4d_lib.video.border_colors import missing_parts
+from dg4d_lib.video.border_colors import color_evidence, missing_parts
 from dg4d_lib.video.color_models import MIN_VARIANCE, fit_mixture
 from dg4d_lib.video.matting import Matte, _closer, matte, matte_from_first_alpha
 from dg4d_lib.video.u2netp import packaged_network
@@ -457,6 +457,27 @@ def test_things_beside_the_subject_in_colors_of_the_border_or_with_soft_outlines
     picture = over(truth, torch.tensor([0.7, 0.1, 0.5]).expand(SIZE, SIZE, 3), back)
     result = matte(picture[None], "network", lambda: Answering(coarse(truth), picture))
     assert iou(result.frames[0, ..., 3], truth) > 0.93
+
+
+def test_colors_of_the_border_speak_against_a_subject_and_others_for_it():
+    truth = ragged() > 0.5
+    lab = rgb2lab(over(truth.float(), torch.tensor([0.1, 0.6, 0.2]).expand(SIZE, SIZE, 3), checks()).numpy())
+    known = torch.where(truth, 0.9, 0.01)
+    known[SIZE // 2 :] = 0.4  # the network is unsure below
+    (evidence,) = color_evidence(lab[None], known[None].double().numpy())
+    below, deep = evidence[SIZE // 2 + 3 :], ndimage.binary_erosion(truth.numpy(), iterations=3)[SIZE // 2 + 3 :]
+    assert below[deep] == pytest.approx(np.log(0.9 / 0.1))  # the bounds of both shares
+    away = ~ndimage.binary_dilation(truth.numpy(), iterations=3)[SIZE // 2 + 3 :]
+    assert below[away] == pytest.approx(0.5 * np.log(0.1 / 0.9))
+
+
+@pytest.mark.parametrize("case", ["a subject in the colors of its backdrop", "nothing is sure"])
+def test_colors_that_tell_nothing_are_no_evidence(case):
+    truth = ragged() > 0.5
+    front = checks().flip(0) if "subject" in case else torch.tensor([0.1, 0.6, 0.2]).expand(SIZE, SIZE, 3)
+    lab = rgb2lab(over(truth.float(), front, checks()).numpy())
+    known = torch.where(truth, 0.9, 0.01) if "subject" in case else torch.full((SIZE, SIZE), 0.4)
+    assert not color_evidence(lab[None], known[None].double().numpy()).any()
 
 
 def test_frames_that_the_subject_has_left_stay_empty():
