@@ -20,11 +20,8 @@ CONTRAST = 7.0  # minimum median gradient along a part's outline, Lab units per 
 OUTLINE = 2  # width of the band around the segmentation that is left to its refinement, pixels
 MAX_ADDED = 2.0  # maximum area of all parts relative to the segmentation
 LARGE = 0.25  # minimum area of a part relative to the largest one, where nothing was segmented
-SURE = (
-    0.05,
-    0.8,
-)  # probabilities below and above which a pixel serves to learn how often colors are none of the border's
-FEWEST = 50  # number of such pixels of subject and background each from which they tell
+SURE = 0.05, 0.8  # probabilities below and above which pixels show how often colors are none of the border's
+FEWEST = 50  # such pixels of subject and of background each, from which there is evidence
 RAREST = 0.1  # bound of both shares: U2-Netp is surer than it is right
 LIKE_SHARE = 0.5  # weight of colors that the border has: subjects have patches of them
 SQUARE = np.ones((3, 3), bool)  # a pixel and its neighbors
