@@ -1,6 +1,6 @@
-"""Parts of a subject that a segmentation misses: sharply outlined, in colors that the border of the frames lacks."""
+"""Colors that the border of the frames lacks: parts that a segmentation misses, and evidence where it is unsure."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,43 +20,76 @@ CONTRAST = 7.0  # minimum median gradient along a part's outline, Lab units per 
 OUTLINE = 2  # width of the band around the segmentation that is left to its refinement, pixels
 MAX_ADDED = 2.0  # maximum area of all parts relative to the segmentation
 LARGE = 0.25  # minimum area of a part relative to the largest one, where nothing was segmented
-SURE = 0.05, 0.8  # probabilities below and above which pixels show how often colors are none of the border's
-FEWEST = 50  # such pixels of subject and of background each, from which there is evidence
-RAREST = 0.1  # bound of both shares: U2-Netp is surer than it is right
+CONFIDENT = 0.05, 0.8  # probabilities below and above which a segmentation is sure of background and subject
+FEWEST = 50  # minimum number of such pixels of each
+RAREST = 0.1  # minimum likelihood of either kind of color, in both: U2-Netp is surer than it is right
 LIKE_SHARE = 0.5  # weight of colors that the border has: subjects have patches of them
 SQUARE = np.ones((3, 3), bool)  # a pixel and its neighbors
 
 
-def missing_parts(lab: Float[ndarray, "t h w 3"], found: Bool[ndarray, "t h w"]) -> Bool[ndarray, "t h w"]:
+@dataclass(frozen=True)
+class BorderDistances:
+    """Distances of the colors of all frames to those along their border.
+
+    Attributes:
+        values: to the fourth nearest color of the border, Lab units.
+        tolerance: distance from which a color is none of the border's.
+    """
+
+    values: Float[ndarray, "t h w"]
+    tolerance: float
+
+    @classmethod
+    def of(cls, lab: Float[ndarray, "t h w 3"]) -> "BorderDistances":
+        """Measure frames in CIE Lab; all of them share the colors of their border."""
+        height, width = lab.shape[1:3]
+        colors = lab[:, border_ring(height, width, RING)].reshape(-1, 3)
+        colors = colors[:: max(1, len(colors) // SAMPLES)]
+        to_other_half = _distance(_tree(colors[::2]), colors[1::2])
+        tree, values = _tree(colors), np.empty(lab.shape[:3], np.float32)
+        for frame, distances in zip(lab, values, strict=True):
+            distances[:] = _distance(tree, frame.reshape(-1, 3)).reshape(height, width)
+        return cls(values, float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE)))
+
+    def unlike(self, frame: int) -> Bool[ndarray, "h w"]:
+        """Mark the pixels of a frame whose colors are none of the border's."""
+        return np.asarray(self.values[frame] > self.tolerance)
+
+
+def missing_parts(
+    lab: Float[ndarray, "t h w 3"], border: BorderDistances, found: Bool[ndarray, "t h w"]
+) -> Bool[ndarray, "t h w"]:
     """Mark parts of the subject that are missing in a segmentation.
 
     Args:
         lab: frames in CIE Lab.
+        border: of these frames.
         found: segmentation.
 
     Returns:
         Pixels to add: parts that touch the segmentation, or the largest parts if it is empty in all frames. None in
         frames where they are more than twice its area.
     """
-    tree, tolerance = _border_colors(lab)
     seeded = bool(found.any())
-    return np.stack([_missing(frame, mask, tree, tolerance, seeded) for frame, mask in zip(lab, found, strict=True)])
+    frames = zip(lab, border.values, found, strict=True)
+    return np.stack([_missing(frame, values, mask, border.tolerance, seeded) for frame, values, mask in frames])
 
 
-def color_evidence(lab: Float[ndarray, "t h w 3"], probability: Float[ndarray, "t h w"]) -> Float[ndarray, "t h w"]:
-    """Return log likelihood ratios of subject and background by whether the border has the color of a pixel.
+def color_evidence(border: BorderDistances, probability: Float[ndarray, "t h w"]) -> Float[ndarray, "t h w"]:
+    """Return the log likelihood ratio of subject and background for every pixel, by whether the border has its color.
 
-    How often it has not is learned where a segmentation is sure, frame by frame; where subject and background do not
-    differ so, the ratios are 0.
+    Both likelihoods are estimated in every frame, from the pixels of which a segmentation is sure. Ratios are 0 where
+    there are too few of these, and where the subject has colors of the border as often as the background.
 
     Args:
-        lab: frames in CIE Lab.
+        border: of the frames.
         probability: of the subject.
     """
     evidence = np.zeros(probability.shape)
-    for frame, (mask, known) in enumerate(zip(unlike_border(lab, range(len(lab))), probability, strict=True)):
+    for frame, known in enumerate(probability):
+        mask = border.unlike(frame)
         unlike = ndimage.binary_opening(mask, SQUARE[:2, :2])
-        subject, background = unlike[known > SURE[1]], unlike[known < SURE[0]]
+        subject, background = unlike[known > CONFIDENT[1]], unlike[known < CONFIDENT[0]]
         if min(len(subject), len(background)) < FEWEST:
             continue
         of_subject, of_background = np.clip([subject.mean(), background.mean()], RAREST, 1 - RAREST)
@@ -67,41 +100,23 @@ def color_evidence(lab: Float[ndarray, "t h w 3"], probability: Float[ndarray, "
     return evidence
 
 
-def unlike_border(lab: Float[ndarray, "t h w 3"], frames: Sequence[int]) -> Bool[ndarray, "k h w"]:
-    """Mark the pixels of some frames whose colors are none of those along the border of all frames.
-
-    Args:
-        lab: frames in CIE Lab.
-        frames: numbers of those to mark.
-    """
-    tree, tolerance = _border_colors(lab)
-    shape = lab.shape[1:3]
-    return np.stack([_distance(tree, lab[frame].reshape(-1, 3)).reshape(shape) > tolerance for frame in frames])
-
-
-def _border_colors(lab: Float[ndarray, "t h w 3"]) -> tuple[cKDTree, float]:
-    """Return the colors of the ring of all frames, and the distance from which a color is none of them."""
-    height, width = lab.shape[1:3]
-    colors = lab[:, border_ring(height, width, RING)].reshape(-1, 3)
-    colors = colors[:: max(1, len(colors) // SAMPLES)]
-    to_other_half = _distance(_tree(colors[::2]), colors[1::2])
-    return _tree(colors), float(np.clip(np.quantile(to_other_half, KNOWN_SHARE), *TOLERANCE))
-
-
 def _missing(
-    lab: Float[ndarray, "h w 3"], found: Bool[ndarray, "h w"], tree: cKDTree, tolerance: float, seeded: bool
+    lab: Float[ndarray, "h w 3"],
+    distances: Float[ndarray, "h w"],
+    found: Bool[ndarray, "h w"],
+    tolerance: float,
+    seeded: bool,
 ) -> Bool[ndarray, "h w"]:
     """Mark the missing parts of one frame.
 
     Args:
         lab: frame.
+        distances: of its colors to those of the border.
         found: segmentation.
-        tree: colors of the ring.
         tolerance: distance from which a color is none of the ring's.
         seeded: True to mark parts that touch the segmentation, False to mark the largest parts.
     """
-    distance = np.zeros(found.shape)
-    distance[~found] = _distance(tree, lab[~found])
+    distance = np.where(found, 0, distances)
     unlike = ndimage.binary_opening(distance > tolerance, SQUARE[:2, :2])
     beside = unlike & ~ndimage.binary_dilation(found, iterations=OUTLINE)
     if seeded:

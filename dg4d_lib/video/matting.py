@@ -17,7 +17,7 @@ from dg4d_lib.errors import BadInput
 from dg4d_lib.images import resize_planes
 from dg4d_lib.video import u2netp
 from dg4d_lib.video.backdrop import Backdrop, border_ring, colored_alike, cut_out, fit_backdrop, has_pattern
-from dg4d_lib.video.border_colors import color_evidence, missing_parts, unlike_border
+from dg4d_lib.video.border_colors import BorderDistances, color_evidence, missing_parts
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.guided_filter import guide_to_edges
 from dg4d_lib.video.segmentation_network import Segmentation
@@ -253,49 +253,54 @@ def _by_network(
         if len(frames) == 1:
             found = (found + mirrored) / 2
     lab = _lab(frames, PARTS_SIDE)
-    completed = _complete(lab, _weigh_colors(lab, found))
-    agreement = min(agreement, _agreement_of_completed(lab, found > 0.5, completed > 0.5))
+    border = BorderDistances.of(lab)
+    completed = _complete(lab, border, _weigh_colors(border, found))
+    agreement = min(agreement, _agreement_of_completed(border, found > 0.5, completed > 0.5))
     if len(frames) == 1:
-        closer = _weigh_colors(lab, _closer(frames[0], completed[0], network)[None])
-        completed = _complete(lab, (2 * completed + closer) / 3)
+        closer = _weigh_colors(border, _closer(frames[0], completed[0], network)[None])
+        completed = _complete(lab, border, (2 * completed + closer) / 3)
     return _Segmentation(completed, "network", agreement, True)
 
 
-def _weigh_colors(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
+def _weigh_colors(border: BorderDistances, found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
     """Return a segmentation with the evidence of colors that the border of the frames lacks."""
-    evidence = torch.from_numpy(color_evidence(lab, resize_planes(found[None], lab.shape[1:3])[0].double().numpy()))
+    small = resize_planes(found[None], border.values.shape[1:])[0]
+    evidence = torch.from_numpy(color_evidence(border, small.double().numpy()))
     odds = torch.logit(found.double(), UNSURE) + resize_planes(evidence[None], found.shape[1:])[0]
     return odds.sigmoid().to(found)
 
 
-def _complete(lab: Float[ndarray, "t h w 3"], found: Float[Tensor, "t h2 w2"]) -> Float[Tensor, "t h2 w2"]:
+def _complete(
+    lab: Float[ndarray, "t h w 3"], border: BorderDistances, found: Float[Tensor, "t h2 w2"]
+) -> Float[Tensor, "t h2 w2"]:
     """Return a segmentation with the parts that it misses, found by colors that the border of the frames lacks."""
     segmented = resize_planes(found[None], lab.shape[1:3])[0].numpy() > 0.5
     segmented &= segmented.mean((1, 2), keepdims=True) >= MIN_AREA
-    missing = torch.from_numpy(missing_parts(lab, segmented)).float()
+    missing = torch.from_numpy(missing_parts(lab, border, segmented)).float()
     return torch.maximum(found, FUSED * resize_planes(missing[None], found.shape[1:])[0].clamp(0, 1))
 
 
 def _agreement_of_completed(
-    lab: Float[ndarray, "t h w 3"], found: Bool[Tensor, "t h2 w2"], completed: Bool[Tensor, "t h2 w2"]
+    border: BorderDistances, found: Bool[Tensor, "t h2 w2"], completed: Bool[Tensor, "t h2 w2"]
 ) -> float:
-    """Return the overlap of a completed segmentation with the network's, in the frame in which it is smallest.
+    """Return the overlap (IoU) of a completed segmentation with a second method, in the frame in which it is smallest.
 
-    Where colors that the border lacks overlap with it more, these count: they also confirm what the network found.
-    Where it found nothing, they are the only method, and nothing agrees with them.
+    The second method is the network, or the colors that the border lacks where these overlap more. Colors count only
+    in frames where the network found something: elsewhere the completed segmentation is theirs alone.
 
     Args:
-        lab: frames.
+        border: of the frames.
         found: segmentation by the network.
-        completed: with the parts that it misses.
+        completed: with evidence of colors and missing parts.
     """
-    overlaps = [overlap(one, other) for one, other in zip(found, completed, strict=True)]
-    changed = [i for i, value in enumerate(overlaps) if value < AGREED and found[i].float().mean() >= MIN_AREA]
-    if changed:
-        unlike = torch.from_numpy(unlike_border(lab, changed)).float()
-        by_color = resize_planes(unlike[None], completed.shape[1:])[0] > 0.5
-        for i, mask in zip(changed, by_color, strict=True):
-            overlaps[i] = max(overlaps[i], overlap(mask, completed[i]))
+    overlaps = []
+    for frame, (one, other) in enumerate(zip(found, completed, strict=True)):
+        value = overlap(one, other)
+        if value < AGREED and one.float().mean() >= MIN_AREA:
+            unlike = torch.from_numpy(border.unlike(frame)).float()
+            by_color = resize_planes(unlike[None, None], other.shape)[0, 0] > 0.5
+            value = max(value, overlap(by_color, other))
+        overlaps.append(value)
     return min(overlaps)
 
 

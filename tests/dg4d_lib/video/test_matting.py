@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dg4d_lib.errors import BadInput
 from dg4d_lib.video.backdrop import fit_backdrop
-from dg4d_lib.video.border_colors import color_evidence, missing_parts
+from dg4d_lib.video.border_colors import BorderDistances, color_evidence, missing_parts
 from dg4d_lib.video.matting import Matte, _closer, matte, matte_from_first_alpha
 from dg4d_lib.video.u2netp import packaged_network
 
@@ -426,7 +426,7 @@ def test_what_the_network_misses_before_a_pattern_is_found_by_its_colors(answer,
     known = torch.zeros(SIZE, SIZE) if answer == "nothing" else coarse(truth)
     known[SIZE // 2 :] = 0
     result = matte(picture[None], "auto", lambda: Answering(known, picture))
-    assert result.agreement > 0.9 if agrees else result.agreement < 0.8
+    assert result.agreement > 0.9 if agrees else result.agreement < 0.7
     assert iou(result.frames[0, ..., 3], truth) > 0.95
 
 
@@ -446,7 +446,7 @@ def test_colors_of_the_border_speak_against_a_subject_and_others_for_it():
     lab = rgb2lab(over(truth.float(), torch.tensor([0.1, 0.6, 0.2]).expand(SIZE, SIZE, 3), checks()).numpy())
     known = torch.where(truth, 0.9, 0.01)
     known[SIZE // 2 :] = 0.4  # the network is unsure below
-    (evidence,) = color_evidence(lab[None], known[None].double().numpy())
+    (evidence,) = color_evidence(BorderDistances.of(lab[None]), known[None].double().numpy())
     below, deep = evidence[SIZE // 2 + 3 :], ndimage.binary_erosion(truth.numpy(), iterations=3)[SIZE // 2 + 3 :]
     assert below[deep] == pytest.approx(np.log(0.9 / 0.1))  # the bounds of both shares
     away = ~ndimage.binary_dilation(truth.numpy(), iterations=3)[SIZE // 2 + 3 :]
@@ -459,7 +459,7 @@ def test_colors_that_tell_nothing_are_no_evidence(case):
     front = checks().flip(0) if "subject" in case else torch.tensor([0.1, 0.6, 0.2]).expand(SIZE, SIZE, 3)
     lab = rgb2lab(over(truth.float(), front, checks()).numpy())
     known = torch.where(truth, 0.9, 0.01) if "subject" in case else torch.full((SIZE, SIZE), 0.4)
-    assert not color_evidence(lab[None], known[None].double().numpy()).any()
+    assert not color_evidence(BorderDistances.of(lab[None]), known[None].double().numpy()).any()
 
 
 def test_frames_that_the_subject_has_left_stay_empty():
@@ -468,9 +468,9 @@ def test_frames_that_the_subject_has_left_stay_empty():
     first = over(truth, green, checks())
     last = over(ragged()[::2, ::2].repeat(2, 2), green, checks())
     lab = np.stack([rgb2lab(frame.numpy()) for frame in (first, last)])
-    added = missing_parts(lab, np.stack([truth.numpy() > 0.5, np.zeros((SIZE, SIZE), bool)]))
+    added = missing_parts(lab, BorderDistances.of(lab), np.stack([truth.numpy() > 0.5, np.zeros((SIZE, SIZE), bool)]))
     assert not added[1].any()
-    assert missing_parts(lab[1:], np.zeros((1, SIZE, SIZE), bool)).mean() > 0.1
+    assert missing_parts(lab[1:], BorderDistances.of(lab[1:]), np.zeros((1, SIZE, SIZE), bool)).mean() > 0.1
 
 
 def test_dots_that_touch_the_subject_belong_to_a_dotted_backdrop():
