@@ -22,7 +22,8 @@ from torch import Tensor
 
 from benchmarks.backdrops import photographs, procedural
 from dg4d_lib.errors import BadInput
-from dg4d_lib.video.matting import matte, overlap
+from dg4d_lib.video.matting import matte
+from dg4d_lib.video.segmentation_network import overlap
 from steps.artifacts.media import read_png
 
 LEAST_MEAN, LEAST_WORST = 0.96, 0.85  # bounds on the masks' overlap

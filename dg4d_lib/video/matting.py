@@ -19,8 +19,9 @@ from dg4d_lib.video import u2netp
 from dg4d_lib.video.backdrop import Backdrop, border_ring, colored_alike, cut_out, fit_backdrop, has_pattern
 from dg4d_lib.video.border_colors import BorderDistances, color_evidence, missing_parts
 from dg4d_lib.video.color_models import foreground_log_odds
+from dg4d_lib.video.contradictions import consistent_answers, resized_answer
 from dg4d_lib.video.guided_filter import guide_to_edges
-from dg4d_lib.video.segmentation_network import Segmentation
+from dg4d_lib.video.segmentation_network import BORDER_MARGIN, Segmentation, border_contact, overlap
 from dg4d_lib.video.soft_edges import free_colors, unmix
 from dg4d_lib.video.still_pixels import average_still_pixels
 
@@ -36,7 +37,6 @@ PART = 0.02  # minimum area of a part relative to the largest one; smaller parts
 PATTERN_KEEPS = 0.6  # minimum area of a subject without a pattern's colors, relative to the one with them
 AGREED = 0.9  # overlap (IoU) from which backdrop and network are taken to have found the same subject
 BAND = 2  # half of the band along an outline before a plain backdrop, pixels of the segmentation
-BORDER_MARGIN = 0.02  # share of the border by which the network may touch more of it and still be preferred
 TELLING = 0.92  # share of subject and background, on average, that their colors tell apart where colors are trusted
 SURE = {True: 0.07, False: 0.012}  # bound of the segmentation's log odds, as a probability, by trust in colors
 COLOR_SHARE = 0.5  # weight of the color models in the log odds; the rest is the segmentation's
@@ -211,17 +211,6 @@ def _subject_before(
     return torch.from_numpy(np.stack(kept))
 
 
-def overlap(one: Bool[Tensor, "*s"], other: Bool[Tensor, "*s"]) -> float:
-    """Return the intersection of two masks over their union; 1 if both are empty."""
-    union = int((one | other).sum())
-    return int((one & other).sum()) / union if union else 1.0
-
-
-def border_contact(masks: Bool[Tensor, "t h w"]) -> float:
-    """Return the share of the frames' border that masks cover."""
-    return float(masks[:, torch.from_numpy(border_ring(*masks.shape[1:]))].float().mean())
-
-
 def _by_backdrop(lab: Float[ndarray, "t h w 3"], backdrop: Backdrop) -> Float[Tensor, "t h w"]:
     subject, spots = _without_spots(cut_out(lab, backdrop))
     if has_pattern(subject, spots):
@@ -241,17 +230,21 @@ def _by_network(
     network: Segmentation,
     known: Mapping[int, Float[Tensor, "h w"]] | None = None,
 ) -> _Segmentation:
-    """Segment all frames, known ones excepted; compare some with the answer to the mirrored frame."""
-    size = _reduced(frames, REFINED_SIDE)
-    known = known or {}
-    answers = (known[i] if i in known else network.probability(frame) for i, frame in enumerate(frames))
-    found = torch.stack([resize_planes(answer[None, None], size)[0, 0] for answer in answers])
-    agreement = 1.0
-    for i in _spread(len(frames)):
-        mirrored = resize_planes(network.probability(frames[i].flip(1)).flip(1)[None, None], size)[0, 0]
-        agreement = min(agreement, overlap(found[i] > 0.5, mirrored > 0.5))
-        if len(frames) == 1:
-            found = (found + mirrored) / 2
+    """Segment all frames; compare some with the answer to the mirrored frame.
+
+    Args:
+        frames: sRGB in [0, 1].
+        network: to ask.
+        known: its answers to the frames that are compared.
+    """
+    size, checked = _reduced(frames, REFINED_SIDE), {i: frames[i] for i in _spread(len(frames))}
+    network, answers = consistent_answers(network, checked, size, known or {})
+    agreement, asked = answers.agreement, answers.plain
+    found = torch.stack(
+        [asked[i] if i in asked else resized_answer(network, frames[i], size) for i in range(len(frames))]
+    )
+    if len(frames) == 1:
+        found = (found + answers.mirrored[0]) / 2
     lab = _lab(frames, PARTS_SIDE)
     border = BorderDistances.of(lab)
     completed = _complete(lab, border, _weigh_colors(border, found))

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
 from dg4d_lib.errors import BackendUnavailable, BadInput
 from dg4d_lib.images import resize_planes
+from dg4d_lib.video.backdrop import border_ring
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -22,6 +23,7 @@ PREPROCESSING = "preprocessor_config.json"  # beside it, in the format of transf
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 DEFAULT_SIDE = 1024  # pixels, for models of any input size whose configuration names none
 LARGEST_SIDE = 4096  # pixels
+BORDER_MARGIN = 0.02  # share of the border by which one mask may touch more of it than another and still be preferred
 ERRORS_ONLY = 3  # onnxruntime's log level
 
 
@@ -75,6 +77,17 @@ class SegmentationNetwork:
         found = _probability(np.asarray(answer, np.float32))
         height, width = picture.shape[:2]
         return resize_planes(torch.from_numpy(found)[None, None], (height, width))[0, 0].clamp(0, 1)
+
+
+def overlap(one: Bool[Tensor, "*s"], other: Bool[Tensor, "*s"]) -> float:
+    """Return the intersection of two masks over their union; 1 if both are empty."""
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else 1.0
+
+
+def border_contact(masks: Bool[Tensor, "t h w"]) -> float:
+    """Return the share of the frames' border that masks cover."""
+    return float(masks[:, torch.from_numpy(border_ring(*masks.shape[1:]))].float().mean())
 
 
 def load_network(content: bytes, what: str, preprocessing: Preprocessing = Preprocessing()) -> SegmentationNetwork:

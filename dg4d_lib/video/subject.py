@@ -24,8 +24,8 @@ from dg4d_lib.video.framing import (
     reframe,
     resample,
 )
-from dg4d_lib.video.matting import Matte, matte, overlap
-from dg4d_lib.video.segmentation_network import Segmentation
+from dg4d_lib.video.matting import Matte, matte
+from dg4d_lib.video.segmentation_network import Segmentation, overlap
 from dg4d_lib.video.soft_edges import free_colors
 
 OVERSAMPLING = 2  # maximum size of opaque frames before matting, relative to the size of the square
