@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +28,6 @@ from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
 from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
-from dg4d_lib.guidance.mixed import MixedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
@@ -75,19 +73,7 @@ STABLE_UNET = KNOWN["stable-zero123"].published["unet/diffusion_pytorch_model.sa
 ORACLE_NOTE = "prior: ground-truth views of a bank; for tests and benchmarks only"
 
 
-class Tracked(NamedTuple):
-    """Shapes of all frames from the surface of the first one.
-
-    Attributes:
-        guesses: equally probable ones.
-        carried_share: of the shapes that optical flow carries, in their mean with the guesses.
-    """
-
-    guesses: Sequence[SubjectShapes]
-    carried_share: float
-
-
-Track = Callable[[InflatedSurface], Tracked]
+Track = Callable[[InflatedSurface], SubjectShapes]  # surface of the first frame to the shapes of all frames
 
 
 @dataclass(frozen=True)
@@ -100,7 +86,8 @@ class LoadedPrior:
         opened: weights; None for priors without a model.
         batches: micro-batches, which shrink when memory runs out.
         shapes: shapes behind the prior; None for models of pictures and for the oracle.
-        network: shapes by the shape network, for all frames or those without known views; None: it is not used.
+        network: shapes by the shape network, for all frames or those without known views; None: there are none.
+        carved: True if predictions of the shape network carve a visual hull.
     """
 
     prior: GuidancePrior
@@ -109,6 +96,7 @@ class LoadedPrior:
     batches: MicroBatches | None = None
     shapes: SubjectShapes | None = None
     network: LearnedShapes | None = None
+    carved: bool = False
 
     def threads(self) -> AbstractContextManager[None]:
         """Return the context of a fit: without a model, all operators of torch are small."""
@@ -119,8 +107,9 @@ class LoadedPrior:
         run_notes = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
         notes: tuple[str, ...] = (self.note,)
-        if self.network is not None:
+        if self.network is not None or self.carved:
             weights = packaged.digests()
+        if self.network is not None:
             share = self.network.inflated_share
             notes = (self.note, inflated_note(share)) if share >= SMALLEST_NOTED else notes
         return StepReport(backend, weights, licenses, notes=notes, run_notes=run_notes)
@@ -168,7 +157,8 @@ def make_prior(
                 weights = dict.fromkeys(shapes.frames, 1.0)
                 prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if track else guided, weights)
                 network = _network(shapes.guess, settings)
-                return LoadedPrior(prior, known_note(sides, shapes.has_predictions), shapes=shapes, network=network)
+                carved = shapes.has_predictions
+                return LoadedPrior(prior, known_note(sides, carved), shapes=shapes, network=network, carved=carved)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, guided
             elif settings.depth_weights and not hint.sigma:
@@ -204,7 +194,7 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        track: moves the surface of known views of the first frame; its guesses are averaged with the carried one.
+        track: moves the surface of known views of the first frame; None: optical flow carries its shape along.
     """
     others = known_by_frame(sides, len(cutouts))
     known = {frame: [known_view(cutouts[frame]), *views] for frame, views in others.items()}
@@ -214,11 +204,12 @@ def subject_shapes(
     if 0 in known and len(cutouts) > 1:
         volume = known_volume(known[0], predict)
         surfaces[0] = colored_surface(volume, known[0])
-        first, normal = known_field(known[0], volume, surfaces[0]), mirror_normal(surfaces[0].vertices.double().numpy())
-        shapes = _carried_shapes(settings, cutouts, hint, first, normal)
         if track is not None:
-            moved, share = track(surfaces[0])
-            shapes = MixedShapes([*moved, shapes], [*[(1 - share) / len(moved)] * len(moved), share])
+            shapes = track(surfaces[0])
+        else:
+            first = known_field(known[0], volume, surfaces[0])
+            normal = mirror_normal(surfaces[0].vertices.double().numpy())
+            shapes = _carried_shapes(settings, cutouts, hint, first, normal)
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -258,7 +249,6 @@ def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
     """Return the shapes if the shape network predicts them."""
-    shapes = shapes.guesses[-1] if isinstance(shapes, MixedShapes) else shapes
     return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
 
 

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import count
 
@@ -30,7 +31,6 @@ from dg4d_lib.rasterizer.interface import Rasterizer
 from dg4d_lib.settings import GeometricPriorSettings, LearnedPriorSettings, MotionSettings, PriorSettings
 from dg4d_lib.video.driving import DrivingVideo
 from dg4d_lib.visual_hull.shape import ALL_AROUND
-from steps.fitting.priors import Tracked
 
 TRACKED_NOTE = "motion of unseen sides: the surface of the known views, tracked through the video"
 FLOW = AssetSettings(rigidity_loss="l1", rigid_parts=0)  # for hulls of many views
@@ -41,8 +41,6 @@ BESIDE_SOFT = (SWING, FLOW)  # for what keeps it
 BENT = tuple(FLOW.model_copy(update={"rigidity_loss": "log", "size": size}) for size in (112, 144))
 BESIDE_FLOW = (*BENT, SOFT)  # likewise
 SWINGS = tuple(SWING.model_copy(update={"rigidity": rigidity}) for rigidity in (2.0, 4.0))  # beside SWING
-CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside tracked ones: more is foggy where limbs move
-CARRIED_BESIDE_SEVERAL = 0.4  # likewise, beside several trackings that keep the outline
 HINGE_SEED = 0  # of the tracking for the search of a hinge; its own, so that all other random numbers stay the same
 FOLLOWED = 0.93  # overlap of silhouettes with the video, IoU, below which flow is compared with a descent
 
@@ -85,8 +83,9 @@ class SurfaceTracker:
     tracked with little rigidity for its search, as a stiff lid does not tear off. Else a surface that loses
     the outline, or that flow follows badly, is tracked a second time, with limbs that swing; `swinging_is_better`
     chooses between the two motions. Surfaces are then tracked in two or three more ways, whose errors at unseen sides
-    differ: two stiffer ones where limbs swing; else hulls of few pictures by flow and with limbs that swing, those of
-    many by flow with few joints that bend a lot, in two sizes of the pictures, and by descent.
+    differ, and every vertex takes the median of its places. The ways are two stiffer ones where limbs swing; else
+    hulls of few pictures by flow and with limbs that swing, those of many by flow with few joints that bend a lot, in
+    two sizes of the pictures, and by descent.
     """
 
     def __init__(
@@ -113,28 +112,35 @@ class SurfaceTracker:
         self._here = threading.get_ident()  # callbacks of a job belong to its thread
         self.hinged: Hinged | None = None  # what a call found
 
-    def __call__(self, surface: InflatedSurface) -> Tracked:
-        """Return the surface at all frames, in one way or in each of several ways.
+    def __call__(self, surface: InflatedSurface) -> MovedSurfaces:
+        """Return the surface at all frames.
 
         Raises:
             FitDiverged: a loss became non-finite.
         """
         with torch_on_one_thread():
             ways: Sequence[AssetSettings] = _others(self._first)
-            share = CARRIED_BESIDE_SEVERAL if self._several and self._first is SOFT else CARRIED_SHARE
             moved = self._follow(surface, self._first, self._generator)
             overlap = self._overlap(moved)
             self.hinged = self._on_a_hinge(self._motion_for_hinges(moved)) if overlap >= LOST else None
             if self.hinged:
-                return Tracked([MovedSurfaces(self.hinged.surfaces)], CARRIED_SHARE)
+                return MovedSurfaces(self.hinged.surfaces)
             if overlap < (FOLLOWED if self._first is FLOW else LOST):
                 second = self._follow(surface, SWING, self._generator)
                 if swinging_is_better(overlap, self._overlap(second)):
-                    moved, ways, share = second, SWINGS, CARRIED_SHARE
+                    moved, ways = second, SWINGS
                 elif overlap < LOST:
-                    return Tracked([moved], CARRIED_SHARE)
-            others = self._followed_in(ways, surface) if self._several else []
-            return Tracked([moved, *others], share)
+                    return moved
+            return self._median([moved, *self._followed_in(ways, surface)]) if self._several else moved
+
+    def _median(self, motions: Sequence[MovedSurfaces]) -> MovedSurfaces:
+        """Return the surface whose coordinates are the medians over several motions, frame by frame."""
+        frames = []
+        for frame in range(len(self._video)):
+            surfaces = [moved.surface(frame) for moved in motions]
+            middle = torch.stack([one.vertices for one in surfaces]).quantile(0.5, 0)
+            frames.append(replace(surfaces[0], vertices=middle))
+        return MovedSurfaces(frames)
 
     def _followed_in(self, ways: Sequence[AssetSettings], surface: InflatedSurface) -> list[MovedSurfaces]:
         seeds = torch.randint(2**62, (len(ways),), generator=self._generator).tolist()

@@ -35,7 +35,6 @@ from steps.artifacts.pose import Pose, write_pose
 from steps.fitting import priors
 from steps.fitting.priors import (
     LoadedPrior,
-    Tracked,
     make_oracle_prior,
     make_prior,
     read_bank,
@@ -149,19 +148,19 @@ def test_known_views_of_the_first_frame_guide_all_frames(
         assert sign * float(middles[1] - middles[0]) > 2  # pixels; from behind it moves left
     learned = isinstance(settings, LearnedPriorSettings)
     assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
-    mixed = make_prior(
+    tracked = make_prior(
         settings,
         cutouts,
         MotionSettings(),
         None,
         tmp_path,
         sides=sides,
-        track=lambda first: Tracked([MovedSurfaces([first] * 2)], 0.3),
+        track=lambda first: MovedSurfaces([first] * 2),
     )
-    assert isinstance(mixed.prior, AnalyticPrior) and mixed.prior.weight == 1
-    _, between = mixed.prior.clean([GuidanceView(camera, 1)])
-    assert float((between[0] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still
-    assert bool(mixed.report("cpu").weights) == learned
+    assert isinstance(tracked.prior, AnalyticPrior) and tracked.prior.weight == 1
+    _, still = tracked.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
+    assert float((still[0] - still[1]).abs().max()) < 0.1  # as the tracked shape, not pulled along by optical flow
+    assert bool(tracked.report("cpu").weights) == learned
 
 
 @pytest.mark.parametrize("settings", [GeometricPriorSettings(size=32), LearnedPriorSettings()])
