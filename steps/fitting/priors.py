@@ -28,6 +28,7 @@ from dg4d_lib.guidance.interface import GuidancePrior, SubjectShapes
 from dg4d_lib.guidance.kept_views import KeptViews
 from dg4d_lib.guidance.known import KnownShapes
 from dg4d_lib.guidance.learned import LearnedShapes
+from dg4d_lib.guidance.mixed import MixedShapes
 from dg4d_lib.guidance.oracle import Bank, perturb
 from dg4d_lib.guidance.zero123 import Zero123
 from dg4d_lib.images import over_white
@@ -47,7 +48,7 @@ from dg4d_lib.settings import (
 from dg4d_lib.shape_prior import packaged
 from dg4d_lib.shape_prior.field import Fields, InflatedFields, ShapeField, ShapeFields
 from dg4d_lib.visual_hull.frustum_field import known_field
-from dg4d_lib.visual_hull.known import KnownView, known_view
+from dg4d_lib.visual_hull.known import KnownView, known_view, shows_sides
 from dg4d_lib.visual_hull.shape import known_volume
 from dg4d_lib.visual_hull.surface import colored_surface
 from dg4d_lib.weights.registry import KNOWN
@@ -68,6 +69,7 @@ DEPTH_NOTE = "prior: inflation of the silhouette, with the relief of an estimate
 SMALLEST_NOTED = 0.05  # share of the inflation from which the report mentions it
 GUESS_WEIGHT = 0.5  # of frames whose other sides are a guess, beside frames with known views
 NETWORK_TRUST = 4 / 3  # factor on the yaw: the network's own estimate counteracts it
+CARRIED_SHARE = 0.3  # of shapes that optical flow carries, beside a tracked hull of which no picture shows the sides
 CARRIED_CONTRAST = 2.0  # of shapes that a known first frame has made sure already
 STABLE_UNET = KNOWN["stable-zero123"].published["unet/diffusion_pytorch_model.safetensors"]  # sha256
 ORACLE_NOTE = "prior: ground-truth views of a bank; for tests and benchmarks only"
@@ -194,7 +196,8 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        track: moves the surface of known views of the first frame; None: optical flow carries its shape along.
+        track: moves the surface of known views of the first frame. Without it, optical flow carries its shape along;
+            if no view shows the sides, the mean of both counts.
     """
     others = known_by_frame(sides, len(cutouts))
     known = {frame: [known_view(cutouts[frame]), *views] for frame, views in others.items()}
@@ -204,12 +207,15 @@ def subject_shapes(
     if 0 in known and len(cutouts) > 1:
         volume = known_volume(known[0], predict)
         surfaces[0] = colored_surface(volume, known[0])
-        if track is not None:
-            shapes = track(surfaces[0])
+        tracked = track(surfaces[0]) if track else None
+        if tracked and shows_sides([view.camera for view in known[0]]):
+            shapes = tracked
         else:
             first = known_field(known[0], volume, surfaces[0])
             normal = mirror_normal(surfaces[0].vertices.double().numpy())
             shapes = _carried_shapes(settings, cutouts, hint, first, normal)
+            if tracked:
+                shapes = MixedShapes([tracked, shapes], [1 - CARRIED_SHARE, CARRIED_SHARE])
     elif isinstance(settings, LearnedPriorSettings):
         shapes = LearnedShapes(learned_fields(cutouts, hint), settings)
     else:
@@ -249,6 +255,7 @@ def learned_fields(cutouts: Sequence[Float[Tensor, "h w 4"]], hint: DepthHint) -
 
 def _network(shapes: SubjectShapes, settings: PriorSettings) -> LearnedShapes | None:
     """Return the shapes if the shape network predicts them."""
+    shapes = shapes.guesses[-1] if isinstance(shapes, MixedShapes) else shapes
     return shapes if isinstance(settings, LearnedPriorSettings) and isinstance(shapes, LearnedShapes) else None
 
 

@@ -159,8 +159,30 @@ def test_known_views_of_the_first_frame_guide_all_frames(
     )
     assert isinstance(tracked.prior, AnalyticPrior) and tracked.prior.weight == 1
     _, still = tracked.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
-    assert float((still[0] - still[1]).abs().max()) < 0.1  # as the tracked shape, not pulled along by optical flow
+    assert float((still[0] - still[1]).abs().max()) < 0.1  # the tracked hull alone
     assert bool(tracked.report("cpu").weights) == learned
+
+
+def test_optical_flow_counts_beside_a_tracked_hull_of_which_no_view_shows_the_sides(tmp_path: Path) -> None:
+    alpha = torch.zeros(64, 64, 1)
+    alpha[20:44, 20:40] = 1
+    cutouts = [torch.cat([torch.full((64, 64, 3), 0.4), alpha.roll(shift, 1)], -1) for shift in (0, 6)]
+    behind = Bank((OrbitCamera(0, 180, width=64, height=64),), (0,), (cutouts[0].flip(1) * 255).byte()[None, None])
+    choice = make_prior(
+        GeometricPriorSettings(size=32),
+        cutouts,
+        MotionSettings(),
+        None,
+        tmp_path,
+        sides=behind,
+        track=lambda first: MovedSurfaces([first] * 2),
+    )
+    camera = OrbitCamera(width=64, height=64)
+    _, (first, second) = choice.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
+    assert float(first[32, 37]) > 0.9
+    left, entered = float(second[32, 21]), float(second[32, 43])
+    assert left == pytest.approx(0.7, abs=0.1)  # where the tracked hull stands still
+    assert entered == pytest.approx(0.3, abs=0.1)  # where flow carries the other
 
 
 @pytest.mark.parametrize("settings", [GeometricPriorSettings(size=32), LearnedPriorSettings()])
