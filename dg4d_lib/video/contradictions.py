@@ -1,6 +1,6 @@
 """Answers of a segmentation network to frames and to mirrored ones; negatives count where the two contradict."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -83,10 +83,10 @@ def consistent_answers(
     Returns:
         The network to ask about all other frames, and its answers.
     """
-    answers = _ask(network, frames, size, known)
+    answers = _ask(network.probability, frames, size, known)
     if answers.trust >= CONTRADICTORY:
         return network, answers
-    other = _ask(network, {i: 1 - frame for i, frame in frames.items()}, size, {})
+    other = _ask(lambda picture: network.probability(1 - picture), frames, size, {})
     if not other.trust or other.border_contact > answers.border_contact + BORDER_MARGIN:
         return network, answers
     share = other.trust**2 / (answers.trust**2 + other.trust**2)
@@ -105,16 +105,13 @@ def resized_answer(
 
 
 def _ask(
-    network: Segmentation,
+    probability: Callable[[Tensor], Tensor],
     frames: Mapping[int, Float[Tensor, "h w 3"]],
     size: tuple[int, int],
     known: Mapping[int, Float[Tensor, "h w"]],
 ) -> Answers:
-    plain = {
-        i: _resized(known[i], size) if i in known else resized_answer(network, frame, size)
-        for i, frame in frames.items()
-    }
-    return Answers(plain, {i: resized_answer(network, frame.flip(1), size).flip(1) for i, frame in frames.items()})
+    plain = {i: _resized(known[i] if i in known else probability(frame), size) for i, frame in frames.items()}
+    return Answers(plain, {i: _resized(probability(frame.flip(1)).flip(1), size) for i, frame in frames.items()})
 
 
 def _mean(one: Float[Tensor, "h w"], other: Float[Tensor, "h w"], share: float) -> Float[Tensor, "h w"]:

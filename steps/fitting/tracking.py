@@ -138,7 +138,8 @@ class SurfaceTracker:
         frames = []
         for frame in range(len(self._video)):
             surfaces = [moved.surface(frame) for moved in motions]
-            middle = torch.stack([one.vertices for one in surfaces]).quantile(0.5, 0)
+            places = torch.stack([one.vertices for one in surfaces]).sort(0).values
+            middle = (places[(len(places) - 1) // 2] + places[len(places) // 2]) / 2
             frames.append(replace(surfaces[0], vertices=middle))
         return MovedSurfaces(frames)
 
