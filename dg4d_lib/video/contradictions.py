@@ -8,10 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dg4d_lib.images import resize_planes
-from dg4d_lib.video.segmentation_network import BORDER_MARGIN, Segmentation, border_contact, overlap
+from dg4d_lib.video.segmentation_network import BORDER_MARGIN, MIN_AREA, Segmentation, border_contact, overlap
 
 CONTRADICTORY = 0.7  # overlap (IoU) with the answer to the mirrored frame below which negatives count, too
-SUBJECT_SHARE = 0.005  # minimum share of a frame that the subject covers
 LEAST_CERTAIN = 0.01  # bound of probabilities whose log-odds are averaged
 
 
@@ -37,7 +36,7 @@ class Answers:
     def trust(self) -> float:
         """Agreement, or 0 if there is no subject in any frame: empty answers agree, but tell nothing."""
         shares = [float((one > 0.5).float().mean()) for one in self.plain.values()]
-        return self.agreement if max(shares) >= SUBJECT_SHARE else 0.0
+        return self.agreement if max(shares) >= MIN_AREA else 0.0
 
     @property
     def border_contact(self) -> float:

@@ -21,7 +21,7 @@ from dg4d_lib.video.border_colors import BorderDistances, color_evidence, missin
 from dg4d_lib.video.color_models import foreground_log_odds
 from dg4d_lib.video.contradictions import consistent_answers, resized_answer
 from dg4d_lib.video.guided_filter import guide_to_edges
-from dg4d_lib.video.segmentation_network import BORDER_MARGIN, Segmentation, border_contact, overlap
+from dg4d_lib.video.segmentation_network import BORDER_MARGIN, MIN_AREA, Segmentation, border_contact, overlap
 from dg4d_lib.video.soft_edges import free_colors, unmix
 from dg4d_lib.video.still_pixels import average_still_pixels
 
@@ -30,7 +30,6 @@ NetworkLoader = Callable[[], Segmentation]
 
 BACKDROP_SIDE = 640  # longest side for the segmentation in front of plain backdrops, pixels
 REFINED_SIDE = 512  # longest side for color models and for the coefficients of the guided filter, pixels
-MIN_AREA = 0.005  # minimum share of the first frame that the subject covers
 MAX_AREA = 0.95  # maximum share of the first frame that the subject covers
 MAX_BORDER = 0.85  # maximum share of the border that the subject touches
 PART = 0.02  # minimum area of a part relative to the largest one; smaller parts are dropped

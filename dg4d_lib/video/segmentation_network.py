@@ -23,6 +23,7 @@ PREPROCESSING = "preprocessor_config.json"  # beside it, in the format of transf
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 DEFAULT_SIDE = 1024  # pixels, for models of any input size whose configuration names none
 LARGEST_SIDE = 4096  # pixels
+MIN_AREA = 0.005  # minimum share of a frame that a subject covers
 BORDER_MARGIN = 0.02  # share of the border by which one mask may touch more of it than another and still be preferred
 ERRORS_ONLY = 3  # onnxruntime's log level
 

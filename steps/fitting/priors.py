@@ -89,7 +89,6 @@ class LoadedPrior:
         batches: micro-batches, which shrink when memory runs out.
         shapes: shapes behind the prior; None for models of pictures and for the oracle.
         network: shapes by the shape network, for all frames or those without known views; None: there are none.
-        carved: True if predictions of the shape network carve a visual hull.
     """
 
     prior: GuidancePrior
@@ -98,7 +97,6 @@ class LoadedPrior:
     batches: MicroBatches | None = None
     shapes: SubjectShapes | None = None
     network: LearnedShapes | None = None
-    carved: bool = False
 
     def threads(self) -> AbstractContextManager[None]:
         """Return the context of a fit: without a model, all operators of torch are small."""
@@ -109,7 +107,8 @@ class LoadedPrior:
         run_notes = self.batches.notes() if self.batches else ()
         weights, licenses = (self.opened.digests, self.opened.licenses) if self.opened else ({}, {})
         notes: tuple[str, ...] = (self.note,)
-        if self.network is not None or self.carved:
+        carves = isinstance(self.shapes, KnownShapes) and self.shapes.has_predictions  # the network, a visual hull
+        if self.network is not None or carves:
             weights = packaged.digests()
         if self.network is not None:
             share = self.network.inflated_share
@@ -159,8 +158,7 @@ def make_prior(
                 weights = dict.fromkeys(shapes.frames, 1.0)
                 prior = AnalyticPrior(clean, noise, viewpoints, frames, 1.0 if track else guided, weights)
                 network = _network(shapes.guess, settings)
-                carved = shapes.has_predictions
-                return LoadedPrior(prior, known_note(sides, carved), shapes=shapes, network=network, carved=carved)
+                return LoadedPrior(prior, known_note(sides, shapes.has_predictions), shapes=shapes, network=network)
             if isinstance(settings, LearnedPriorSettings):
                 note, weight = LEARNED_NOTE, guided
             elif settings.depth_weights and not hint.sigma:
@@ -196,8 +194,8 @@ def subject_shapes(
         cutouts: the subject at every frame.
         hint: at its depth; see `subject_hint`. A depth picture goes before an estimate by `prior.depth_weights`.
         sides: views of other sides; their hull replaces the shapes of their frames.
-        track: moves the surface of known views of the first frame. Without it, optical flow carries its shape along;
-            if no view shows the sides, the mean of both counts.
+        track: moves the surface of known views of the first frame; None: optical flow carries its shape along. If no
+            view shows the sides, the mean of the tracked and the carried shapes is returned.
     """
     others = known_by_frame(sides, len(cutouts))
     known = {frame: [known_view(cutouts[frame]), *views] for frame, views in others.items()}

@@ -148,19 +148,27 @@ def test_known_views_of_the_first_frame_guide_all_frames(
         assert sign * float(middles[1] - middles[0]) > 2  # pixels; from behind it moves left
     learned = isinstance(settings, LearnedPriorSettings)
     assert bool(choice.report("cpu").weights) == learned  # the network has guessed frame 1
-    tracked = make_prior(
+    tracked = prior_of_a_still_hull(settings, cutouts, sides, tmp_path)
+    assert isinstance(tracked.prior, AnalyticPrior) and tracked.prior.weight == 1
+    _, still = tracked.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
+    assert float((still[1] - cover[1]).abs().max()) > 0.1  # pulled towards the tracked shape, which stands still
+    assert float((still[0] - still[1]).abs().max()) < 0.1  # that shape alone
+    assert bool(tracked.report("cpu").weights) == learned
+
+
+def prior_of_a_still_hull(
+    settings: GeometricPriorSettings | LearnedPriorSettings, cutouts: list[torch.Tensor], sides: Bank, scratch: Path
+) -> LoadedPrior:
+    """Return the prior of two frames of which known views show the first; its tracked hull stands still."""
+    return make_prior(
         settings,
         cutouts,
         MotionSettings(),
         None,
-        tmp_path,
+        scratch,
         sides=sides,
         track=lambda first: MovedSurfaces([first] * 2),
     )
-    assert isinstance(tracked.prior, AnalyticPrior) and tracked.prior.weight == 1
-    _, still = tracked.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
-    assert float((still[0] - still[1]).abs().max()) < 0.1  # the tracked hull alone
-    assert bool(tracked.report("cpu").weights) == learned
 
 
 def test_optical_flow_counts_beside_a_tracked_hull_of_which_no_view_shows_the_sides(tmp_path: Path) -> None:
@@ -168,15 +176,7 @@ def test_optical_flow_counts_beside_a_tracked_hull_of_which_no_view_shows_the_si
     alpha[20:44, 20:40] = 1
     cutouts = [torch.cat([torch.full((64, 64, 3), 0.4), alpha.roll(shift, 1)], -1) for shift in (0, 6)]
     behind = Bank((OrbitCamera(0, 180, width=64, height=64),), (0,), (cutouts[0].flip(1) * 255).byte()[None, None])
-    choice = make_prior(
-        GeometricPriorSettings(size=32),
-        cutouts,
-        MotionSettings(),
-        None,
-        tmp_path,
-        sides=behind,
-        track=lambda first: MovedSurfaces([first] * 2),
-    )
+    choice = prior_of_a_still_hull(GeometricPriorSettings(size=32), cutouts, behind, tmp_path)
     camera = OrbitCamera(width=64, height=64)
     _, (first, second) = choice.prior.clean([GuidanceView(camera, frame) for frame in (0, 1)])
     assert float(first[32, 37]) > 0.9
