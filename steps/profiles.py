@@ -368,7 +368,7 @@ PREVIEW = revise(
         "motion.fine_tune": True,
         "motion.plane_lr": 0.0256,
         "motion.network_lr": 0.00256,
-        "motion.rigidity_weight": 300.0,
+        "motion.rigidity_weight": 150.0,
         "motion.resolution_schedule": PREVIEW_SCHEDULE,
         "motion.reference_size": 256,
         "motion.reference_schedule": SMALL_AT_FIRST,

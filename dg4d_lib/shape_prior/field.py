@@ -25,7 +25,7 @@ INFLATED_SOFTNESS = 0.05  # world units: depth over which the occupancy of an in
 SURE, UNSURE = 0.8, 0.95  # expected 1 - p of matter: below it the network alone, above it the inflation alone
 SMOOTHNESS, KNOWN_SMOOTHNESS = 2.0, 1.0  # cells: of surfaces that the network guesses, and of those that are known
 LARGEST_LOGIT = 5.3  # probabilities are kept from 0.005 to 0.995
-HIDDEN_BRIGHTNESS = 0.8  # of hidden matter, relative to the picture: what the network says of it is too dark
+HIDDEN_BRIGHTNESS = 0.87  # of hidden matter, relative to the picture: what the network says of it is too dark
 LARGEST_GAIN, DARKEST = 2.0, 0.02  # of hidden colors, either way; luminance below which nothing is brighter
 
 
