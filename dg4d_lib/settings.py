@@ -117,13 +117,6 @@ class LearnedPriorSettings(Settings):
         "shapes, with this factor on the occupancy log-odds: closer to the ground truth on average, but foggy "
         "(typical: 2)",
     )
-    color_contrast: float = Field(
-        1.5,
-        ge=0,
-        le=16,
-        description="0: the surface has its own colors in all views; otherwise what the picture shows has, seen from "
-        "the side, the color averaged over all possible shapes, with this factor on the occupancy log-odds",
-    )
 
 
 class Zero123PriorSettings(Settings):

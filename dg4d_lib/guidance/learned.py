@@ -1,9 +1,5 @@
-"""Views of a subject by the shape prior: of its most probable surface, or averages over all possible shapes.
+"""Views of a subject by the shape prior: of its most probable surface, or averages over all possible shapes."""
 
-What the picture shows has the color of these averages on the surface, too, seen from the side.
-"""
-
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,11 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dg4d_lib.cameras.orbit import OrbitCamera
 from dg4d_lib.guidance.geometric import surface_views
 from dg4d_lib.guidance.interface import GuidanceView, check_frame, check_views
 from dg4d_lib.images import resize
-from dg4d_lib.inflation.render import render_surface
 from dg4d_lib.inflation.surface import InflatedSurface
 from dg4d_lib.kernels.workers import run_parallel, torch_on_one_thread
 from dg4d_lib.settings import LearnedPriorSettings
@@ -27,7 +21,6 @@ from dg4d_lib.shape_prior.raymarch import ShapeVolume, render_volumes
 from dg4d_lib.shape_prior.surface import decided_surface
 
 COARSER = 2  # times fewer pixels of a side than the camera has: expected views are soft
-FAINT = 0.3  # alpha of an expected view below which its color counts for less
 
 
 class LearnedShapes:
@@ -71,50 +64,12 @@ class LearnedShapes:
             BadInput: no views, views of different sizes, or a frame that is not there.
         """
         check_views(views, len(self._fields))
-        if self._settings.contrast:
-            return self._expected(views)
-        with torch_on_one_thread():
-            run_parallel([partial(self._build, frame) for frame in dict.fromkeys(view.frame for view in views)])
-        surfaces, cameras = [self.surface(view.frame) for view in views], [view.camera for view in views]
-        color, alpha = surface_views(surfaces, cameras, SIZE, self._settings.depth_sigma)
-        if self._settings.color_contrast:
-            color = color + self._color_change(views, color, alpha)
-        return color, alpha
-
-    def _build(self, frame: int) -> None:
-        """Build what views of the surface of a frame need, from one prediction."""
-        soft = self._settings.color_contrast > 0
-        if frame in self._surfaces and (frame in self._volumes or not soft):
-            return
-        field = self._field(frame)
-        if frame not in self._surfaces:
-            self._surfaces[frame] = decided_surface(field)
-        if soft:
-            self._volumes[frame] = expected_volume(field, self._settings.color_contrast)
-
-    def _color_change(
-        self, views: Sequence[GuidanceView], color: Float[Tensor, "b h w 3"], alpha: Float[Tensor, "b h w 1"]
-    ) -> Float[Tensor, "b h w 3"]:
-        """Return what views of surfaces lack to the expected color of what the picture shows, seen from the side.
-
-        Where the picture's colors appear from the side depends on a depth that is only guessed.
-
-        Args:
-            views: b cameras, each with its frame.
-            color: of the surfaces, over white.
-            alpha: of the surfaces.
-        """
-        cameras = [view.camera for view in views]
-        expected, cover = self._expected(views)
-        straight = ((expected - 1 + cover) / cover.clamp(min=1e-3)).clamp(0, 1)
-        surfaces = [self.surface(view.frame) for view in views]
-        shown = [replace(each, colors=each.seen[:, None].expand(-1, 3).to(each.colors)) for each in surfaces]
-        seen = render_surface(shown, cameras, supersample=1)[0][..., :1]
-        side = torch.tensor([_sideways(camera) for camera in cameras])[:, None, None, None]
-        return side * seen * (cover / FAINT).clamp(max=1) * (straight * alpha - (color - 1 + alpha))
-
-    def _expected(self, views: Sequence[GuidanceView]) -> tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w 1"]]:
-        """Return color over white and alpha of the averages over all possible shapes."""
+        if not self._settings.contrast:
+            frames = dict.fromkeys(view.frame for view in views)
+            with torch_on_one_thread():
+                run_parallel([partial(self.surface, frame) for frame in frames if frame not in self._surfaces])
+            surfaces = [self.surface(view.frame) for view in views]
+            return surface_views(surfaces, [view.camera for view in views], SIZE, self._settings.depth_sigma)
         size = views[0].camera.height, views[0].camera.width
         coarse = _coarse(size)
         cameras = [replace(view.camera, height=coarse[0], width=coarse[1]) for view in views]
@@ -125,8 +80,7 @@ class LearnedShapes:
 
     def _volume(self, frame: int) -> ShapeVolume:
         if frame not in self._volumes:
-            contrast = self._settings.contrast or self._settings.color_contrast
-            self._volumes[frame] = expected_volume(self._field(frame), contrast)
+            self._volumes[frame] = expected_volume(self._field(frame), self._settings.contrast)
         return self._volumes[frame]
 
     def _field(self, frame: int) -> ShapeField:
@@ -137,12 +91,6 @@ class LearnedShapes:
         field = last[1]
         self._inflated[frame] = field.inflated_share
         return field
-
-
-def _sideways(camera: OrbitCamera) -> float:
-    """Return the squared sine of the angle between a camera and the input camera, seen from the origin."""
-    elevation, azimuth = math.radians(camera.elevation_deg), math.radians(camera.azimuth_deg)
-    return 1 - (math.cos(elevation) * math.cos(azimuth)) ** 2
 
 
 def _coarse(size: tuple[int, int]) -> tuple[int, int]:
