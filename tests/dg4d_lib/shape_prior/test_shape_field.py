@@ -215,7 +215,7 @@ def test_oblong_pictures_are_refused():
 
 @pytest.mark.parametrize(
     ("seen", "guessed", "expected"),
-    [(0.5, 0.3, 0.4), (0.2, 0.3, 0.16), (0.9, 0.1, 0.2), (0.1, 0.9, 0.45), (0.9, 0.6, 0.72), (0.0, 0.0, 0.0)],
+    [(0.5, 0.3, 0.435), (0.2, 0.3, 0.174), (0.9, 0.1, 0.2), (0.1, 0.9, 0.45), (0.9, 0.6, 0.783), (0.0, 0.0, 0.0)],
 )
 def test_hidden_colors_have_the_brightness_that_follows_from_the_picture(
     seen: float, guessed: float, expected: float
