@@ -19,7 +19,7 @@ Object.assign(globalThis, {
   },
   history: { replaceState: () => {} },
   document: { getElementById: () => ({}) },
-  fetch: async () => ({ ok: asked.status < 300, status: asked.status }),
+  fetch: async () => ({ ok: asked.status < 300, status: asked.status, text: async () => "" }),
 });
 const script = /<script[^>]*>(.*)<\/script>/s.exec(await readFile(asked.page, "utf-8"))[1];
 await import(`data:text/javascript,${encodeURIComponent(script)}`);
