@@ -402,13 +402,13 @@ class MotionSettings(FitSettings):
     track_surface: bool = Field(
         True,
         description="with pictures of other sides at the first frame, and prior.kind=geometric or learned: track their "
-        "surface through the video; later frames are guided by the mean of its renders and of the prediction for the "
-        "frame (ours)",
+        "surface through the video; its renders guide later frames, together with those of the shapes that optical "
+        "flow carries if no picture shows the sides (ours)",
     )
     trackings: Literal[1, 3] = Field(
         3,
-        description="number of different trackings of that surface, 4 of one with 12 views or more; "
-        "1: faster by a minute or two (ours)",
+        description="number of different trackings of that surface, whose median counts, 4 of one with 12 views or "
+        "more; 1: faster by a minute or two (ours)",
     )
     fine_tune: bool = Field(False, description="optimize the canonical Gaussians too (paper: no; public code: yes)")
     means_lr: Positive = Field(0.001, description="learning rate of the canonical means at the start (public code)")
